@@ -75,6 +75,10 @@ DIVIDED, SOON, NEARLY_ALL, FINE = 5, 1 / 8, 0.95, 10240
 #: Evaluations for a single surface where no schedule arrives; twice as many without any plan.
 ALONE = 1024
 
+#: A plan that costs so many times what it promised, however it is improved, is one of many: the
+#: evaluations that another one is looked for with.
+BROKEN, ANEW = 1.05, 16384
+
 #: Time constants of the first surface after which, without any plan, an arrival is looked for.
 LONG = 10.0
 
@@ -292,10 +296,17 @@ def search_earlier(task: Optimisation, incumbent: Plan) -> bool:
         return found is not None and found is not incumbent and lead_back(task, found)
     if not task.best_cost < INADMISSIBLE:
         _look_around(task, here)
-    if not task.optimiser.aims:
-        return _along_ridge(task, task.left)
-    _along_ridge(task, min(POLISH, task.left))
-    return _arrive_earlier(task)
+    if task.optimiser.aims:
+        _along_ridge(task, min(POLISH, task.left))
+        converged = _arrive_earlier(task)
+    else:
+        converged = _along_ridge(task, task.left)
+    if task.best_cost > BROKEN * task.promised + 2 * task.loop.step:
+        if task.usual:
+            task.budget = Budget(task.evaluations + ANEW)
+        _arrive_earlier(task, wide=True, keep=POLISH)
+        converged = _along_ridge(task, task.left)
+    return converged
 
 
 def _along_ridge(task: Optimisation, most: int) -> bool:

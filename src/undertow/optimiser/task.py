@@ -99,6 +99,7 @@ class Optimisation:
         self._pace = 0.0
         self.kept = 0
         self.admits: Callable[[Plan], bool] = lambda _: True
+        self.promised, self.usual = math.inf, False
         self.minima: list[float] = []
         self._buffers: dict[int, RolloutBuffers] = {}
 
@@ -129,8 +130,8 @@ class Optimisation:
         optimiser, budget = self.optimiser.plainer, self.budget
         if optimiser is None:
             return None
-        whole, part = (one.usual_budget(False).evaluations for one in (self.optimiser, optimiser))
-        most = max(budget.evaluations - (whole - part), budget.evaluations // 4, 1)
+        own = self.optimiser.usual_cold.evaluations - optimiser.usual_cold.evaluations
+        most = max(budget.evaluations - own, budget.evaluations // 4, 1)
         self.budget = Budget(max(budget.evaluations - most, 1), budget.seconds)
         left = max(budget.seconds - (time.perf_counter() - self.began), ANSWERING)
         return Optimisation(
