@@ -118,7 +118,7 @@ def test_a_cascade_holds_plants_that_differ_from_its_model(
         times.append(run.time)
         lost += not exact.simulate(phi=ut.deg(30), plant=plant).reached
     assert lost >= 1
-    assert np.median(times) < 1.0
+    assert np.median(times) < 0.8  # 0.93 where every plan has to suit every plausible plant
 
 
 @pytest.mark.slow
@@ -376,6 +376,25 @@ def test_a_schedule_leaves_every_plausible_plant_a_way_home(pendulum: ut.Mechani
     assert not refused.accepted
     assert "come home" in refused.reason
     assert refused.cost == pytest.approx(costs.cost[1], rel=1e-6)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-4])
+def test_only_exact_states_leave_it_to_later_decisions(
+    pendulum: ut.Mechanism, noise: float
+) -> None:
+    """A surface that need not suit all is admitted then, and refused where states have errors."""
+    covariance = noise**2 * np.eye(4) if noise else None
+    made = replace(scheduled(pendulum), freedom=ut.DecisionVariables(), covariance=covariance)
+    x, law = pendulum.state(phi=ut.deg(30)), (ut.ReachingLaw(86.0, 4.0),)
+    plan = ut.Plan((ut.Surface(-1, -4.1, 1.24, 8.6),), (0.0,), law)
+    left = 1.01 * float(ut.ClosedLoop(pendulum, made.objective).batch(x, plan).cost[0])
+    assert not made.loop.batch(x, plan, duration=left).reached[0]
+    designed = ut.Plan.of(ut.first_surface(pendulum))
+    assert made.known is not None
+    memory = CascadeState(designed, x=tuple(x.tolist()), estimate=made.known.prior)
+    answer = ut.Proposal(plan, "converged", 0.5, math.inf, (), 1, 0.0, 1, 0.0)
+    after, _ = made.apply_gate(memory, answer, x, left)
+    assert (after.plan == plan) == (not noise)
 
 
 @pytest.mark.slow

@@ -62,6 +62,29 @@ def test_never_worse_than_the_incumbent(
         )
 
 
+@pytest.mark.parametrize(("name", "degrees", "radius"), [("time", 23, 0.3), ("energy", 20, 0.01)])
+def test_a_richer_set_of_variables_never_answers_worse(
+    name: str, degrees: float, radius: float
+) -> None:
+    """It contains the plainer ones; each has a quarter of the budget of the one before.
+
+    Into a large ball, a single surface arrives earlier than the schedule that follows the earliest
+    motion of any input: that motion is a local optimum.
+    """
+    cart = ut.mechanisms.cart_pendulum()
+    loop = ut.ClosedLoop(cart, replace(OBJECTIVES[name], terminal_radius=radius).on(cart))
+    x, free = cart.state(phi=ut.deg(degrees)), ut.DecisionVariables(reaching=True)
+    costs = [
+        ut.Optimiser(loop, freedom=freedom).propose(x, budget=ut.Budget(most)).cost
+        for freedom, most in (
+            (replace(free, schedule=0.1), 8000),
+            (free, 2000),
+            (ut.DecisionVariables(), 500),
+        )
+    ]
+    assert 0.0 < costs[0] <= costs[1] <= costs[2] < math.inf
+
+
 @pytest.mark.parametrize(
     ("name", "at_most"), rest_slow([("energy", 12.0), ("time", 1.15)], ("energy", 12.0))
 )

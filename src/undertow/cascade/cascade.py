@@ -174,8 +174,9 @@ class Cascade:
         :meth:`undertow.Belief.usual`.  Plans are judged on an ensemble of plausible plants, and
         what the motion shows narrows it: law, search and gate go on with the estimated parameters,
         and a plan that some plausible plant would not survive is replaced before its period ends.
-        A schedule for least time is best for the estimate alone, and later decisions mend it: it
-        asks that one of :attr:`reserve` would bring every plausible plant home after a period.
+        Least time is re-optimised for the estimate alone where states are exact, a schedule always,
+        and later decisions mend that: one of :attr:`reserve` has to bring every plausible plant
+        home after a period.
         ``"exact"``: the mechanism is taken for the plant, as in the paper.
     covariance
         Of the error of the estimated state at the target, (2n, 2n), SI units: predictions count the
@@ -357,13 +358,13 @@ class Cascade:
     def _recourse(self) -> bool:
         """Whether plans are for the estimate alone, and later decisions mend them for the plant.
 
-        One schedule that arrives without sliding in does so on one plant only: no mean over an
-        ensemble says what it is worth.
+        What arrives without sliding in does so on one plant only: no mean over an ensemble says
+        what it is worth.  Nor does it bear errors of the state, but a schedule is asked for.
         """
         return (
             self.known is not None
             and self.planner is None
-            and self.freedom.schedule > 0
+            and (self.freedom.schedule > 0 or self.covariance is None)
             and self.loop.counts_time
         )
 
@@ -407,7 +408,8 @@ class Cascade:
         what it finds again.  A time of arrival is a matter of milliseconds, and is not searched
         for with longer steps than it is judged with.
         """
-        loop = self._estimated(None) if self._recourse else self.loop
+        single = self._recourse and self.freedom.schedule > 0
+        loop = self._estimated(None) if single else self.loop
         return Optimiser(
             self._for_search(loop),
             self.first, self.cold, self.warm, self.freedom, seed=self.seed,
@@ -416,7 +418,7 @@ class Cascade:
     @cached_property
     def _robust(self) -> Optimiser:
         """The optimiser of plans that suit every plausible plant."""
-        if not self._recourse:
+        if self.optimiser.loop.ensemble is not None or not self._recourse:
             return self.optimiser
         freedom = replace(self.freedom, schedule=0.0)
         return replace(self.optimiser, loop=self._for_search(self.loop), freedom=freedom)
@@ -741,7 +743,7 @@ class Cascade:
         loops = [whole]
         if self.known is not None and estimate is not None:
             loops.insert(0, whole.believing(whole.mechanism, self.known.alone(estimate)))
-        if self._recourse:
+        if self._recourse and self.freedom.schedule:
             loops.insert(0, self._estimated(estimate))
 
         def smaller(loop: ClosedLoop) -> ClosedLoop:
@@ -863,7 +865,11 @@ class Cascade:
             if self._recourse:
                 optimiser = self._optimiser_of(self._estimated(state.estimate), state.target, t)
                 admits = partial(self._recoverable, loop, error)
-                found = optimiser.propose(error, incumbent=used, admits=admits, **ask)
+                first = state.predicted == state.scale  # nothing was decided since
+                promised = 0.0 if first else state.predicted - (t - state.since)
+                found = optimiser.propose(
+                    error, incumbent=used, admits=admits, promised=promised, **ask
+                )
                 plans = [used] if found.plan is None else [found.plan, used]
                 if any(self._mendable(here, loop, plan, error, span) for plan in plans):
                     return found
@@ -894,8 +900,9 @@ class Cascade:
 
         Where the plan in use does not suit every plausible plant and one in :attr:`reserve` does,
         or is survived longer, that one is compared with, and takes over unless the proposal does.
-        A schedule for least time need not suit them: it is judged on the estimate, as long as one
-        in reserve would bring all of them home after the next period.
+        For least time, where states are exact or with a schedule, it need not suit them: it is
+        judged on the estimate, as long as one in reserve would bring all of them home after the
+        next period.
 
         Where the target moves, what the gate admits is also rolled out along the reference, as is
         the plan in use: constraints have to hold there, and the cost must not rise.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -92,10 +93,21 @@ class Optimiser:
 
     def on(self, loop: ClosedLoop) -> Optimiser:
         """Return this optimiser for a loop of the same structure, with the same first surface."""
+        return self._with(loop=loop)
+
+    def _with(self, **changed: object) -> Optimiser:
+        """Return this optimiser with some fields changed, and the same first surface."""
         other = object.__new__(type(self))
-        kept = {k: v for k, v in vars(self).items() if k not in ("space", "firsts", "aims")}
-        other.__dict__.update(kept, loop=loop, anchor=self.anchor, designs=self.designs)
+        derived = ("space", "firsts", "aims", "plainer")
+        kept = {k: v for k, v in vars(self).items() if k not in derived}
+        other.__dict__.update(kept, anchor=self.anchor, designs=self.designs, **changed)
         return other
+
+    @cached_property
+    def plainer(self) -> Optimiser | None:
+        """The optimiser of a plainer set of decision variables; ``None`` for the plainest."""
+        freedom = self.freedom.plainer
+        return None if freedom is None else self._with(freedom=freedom, cold=None)
 
     @cached_property
     def anchor(self) -> Surface:
@@ -133,16 +145,23 @@ class Optimiser:
         given = self.warm if warm else self.cold
         if given is not None:
             return given
-        size, schedule = self.space.size, self.freedom.schedule > 0
-        if warm and schedule and self.counts_time:
+        if not warm:
+            return self.usual_cold
+        if self.freedom.schedule and self.counts_time:
             return Budget(16384 // self.loop.mechanism.n)
-        if warm:
-            return Budget(4096 if self.aims else 576 if self.counts_time else 1024)
+        return Budget(4096 if self.aims else 576 if self.counts_time else 1024)
+
+    @property
+    def usual_cold(self) -> Budget:
+        """What a global optimisation needs, those with plainer sets of variables included."""
+        plainer = 0 if self.plainer is None else self.plainer.usual_cold.evaluations
+        size = self.space.size
         if self.counts_time:
-            return Budget(16384 * size)
+            return Budget(plainer + 16384 * size)
         size //= self.space.segments
-        several = schedule or self.space.segments > 1
-        return Budget(single_budget(size) + (FINE * size if several else restart_budget(size)))
+        several = self.freedom.schedule > 0 or self.space.segments > 1
+        more = FINE * size if several else restart_budget(size)
+        return Budget(plainer + single_budget(size) + more)
 
     @checked
     def propose(
@@ -156,6 +175,7 @@ class Optimiser:
         resolution: float = 0.0,
         budget: Budget | None = None,
         admits: Callable[[Plan], bool] | None = None,
+        promised: float = math.inf,
     ) -> Proposal:
         """Optimise the plan from the state x.
 
@@ -177,6 +197,9 @@ class Optimiser:
         admits
             Whether a schedule that arrives is admissible besides; where the incumbent is not, the
             answer may be worse.
+        promised
+            What the incumbent was to cost, in a search for an earlier arrival: where nothing near
+            it does, a single surface is looked for far and wide, too.
 
         Returns
         -------
@@ -187,7 +210,8 @@ class Optimiser:
         warm = incumbent is not None
         longest = self.loop.objective.horizon if horizon is None else horizon
         task = self._task(x, longest, budget or self._budget(warm), resolution, sequence, warm)
-        task.admits = admits or task.admits
+        task.admits, task.promised = admits or task.admits, promised
+        task.usual = budget is None and self.warm is None
         if incumbent is None:
             *_, converged = global_search(task)
         elif self.counts_time:

@@ -27,6 +27,7 @@ from undertow.law import Plan, stability_margin
 from undertow.models import FloatArray
 from undertow.optimiser.arrival import SHORTER, ArrivalSearch
 from undertow.optimiser.cma_es import CMAES, minimise
+from undertow.optimiser.proposal import Budget
 from undertow.optimiser.schedules import WIDE, WORTHWHILE, follow_earliest, lead_back
 from undertow.optimiser.switching import SwitchingSurfaces
 from undertow.optimiser.task import Optimisation
@@ -74,6 +75,10 @@ DIVIDED, SOON, NEARLY_ALL, FINE = 5, 1 / 8, 0.95, 10240
 #: Evaluations for a single surface where no schedule arrives; twice as many without any plan.
 ALONE = 1024
 
+#: A plan that costs so many times what it promised, however it is improved, is one of many: the
+#: evaluations that another one is looked for with.
+BROKEN, ANEW = 1.05, 16384
+
 #: Time constants of the first surface after which, without any plan, an arrival is looked for.
 LONG = 10.0
 
@@ -95,6 +100,32 @@ def _descend(
 
 
 def global_search(task: Optimisation) -> Iterator[bool]:
+    """Search, then take over what a plainer set of decision variables allows, where that is better.
+
+    What it allows this one allows, too: no answer is worse than that of a plainer set.  Yields
+    for each answer whether it has converged.
+    """
+    plainer, converged = task.plainer(), False
+    for converged in _own_search(task):
+        yield converged
+    if plainer is None or task.late():
+        return
+    before = task.best_cost
+    *_, done = global_search(plainer)
+    task.budget = Budget(task.budget.evaluations + plainer.budget.evaluations, task.budget.seconds)
+    task.evaluations += plainer.evaluations
+    task.minima.append(plainer.best_cost)
+    if plainer.best is not None:
+        task.consider(plainer.best)
+    if task.best_cost < before:
+        converged = done
+        if task.optimiser.counts_time and task.optimiser.freedom.schedule:
+            for converged in follow_earliest(task):
+                yield converged
+    yield converged
+
+
+def _own_search(task: Optimisation) -> Iterator[bool]:
     """Improve the best of the designs, then look elsewhere; yields whether it has converged."""
     several = len(task.space.freedom.times) > 1 or task.optimiser.freedom.schedule > 0
     several &= not task.optimiser.counts_time
@@ -265,10 +296,17 @@ def search_earlier(task: Optimisation, incumbent: Plan) -> bool:
         return found is not None and found is not incumbent and lead_back(task, found)
     if not task.best_cost < INADMISSIBLE:
         _look_around(task, here)
-    if not task.optimiser.aims:
-        return _along_ridge(task, task.left)
-    _along_ridge(task, min(POLISH, task.left))
-    return _arrive_earlier(task)
+    if task.optimiser.aims:
+        _along_ridge(task, min(POLISH, task.left))
+        converged = _arrive_earlier(task)
+    else:
+        converged = _along_ridge(task, task.left)
+    if task.best_cost > BROKEN * task.promised + 2 * task.loop.step:
+        if task.usual:
+            task.budget = Budget(task.evaluations + ANEW)
+        _arrive_earlier(task, wide=True, keep=POLISH)
+        converged = _along_ridge(task, task.left)
+    return converged
 
 
 def _along_ridge(task: Optimisation, most: int) -> bool:

@@ -66,6 +66,18 @@ class DecisionVariables:
                 "times of a schedule", value=self.times, limit="rising times from 0 s"
             )
 
+    @property
+    def plainer(self) -> DecisionVariables | None:
+        """A set that this one contains: one surface, then plain reaching, then plain α_a.
+
+        ``None`` for the paper's three parameters.
+        """
+        if self.schedule or len(self.times) > 1:
+            return replace(self, schedule=0.0, times=(0.0,))
+        if self.reaching:
+            return replace(self, reaching=False)
+        return replace(self, alpha_a=False) if self.alpha_a else None
+
 
 class SearchSpace:
     """Search coordinates z for plans of one closed loop.

@@ -99,6 +99,7 @@ class Optimisation:
         self._pace = 0.0
         self.kept = 0
         self.admits: Callable[[Plan], bool] = lambda _: True
+        self.promised, self.usual = math.inf, False
         self.minima: list[float] = []
         self._buffers: dict[int, RolloutBuffers] = {}
 
@@ -120,6 +121,23 @@ class Optimisation:
         """Search coordinates of the designs, (N, d)."""
         size = self.space.size // self.space.segments
         return np.tile(self.optimiser.firsts[:, :size], self.space.segments)
+
+    def plainer(self) -> Optimisation | None:
+        """Divide the budget: the task of a plainer set of decision variables has what is left over.
+
+        Or a quarter of it, where that is more.
+        """
+        optimiser, budget = self.optimiser.plainer, self.budget
+        if optimiser is None:
+            return None
+        own = self.optimiser.usual_cold.evaluations - optimiser.usual_cold.evaluations
+        most = max(budget.evaluations - own, budget.evaluations // 4, 1)
+        self.budget = Budget(max(budget.evaluations - most, 1), budget.seconds)
+        left = max(budget.seconds - (time.perf_counter() - self.began), ANSWERING)
+        return Optimisation(
+            optimiser, self.x, self.horizon, Budget(most, left),
+            resolution=self.resolution, sequence=self.sequence, warm=False,
+        )  # fmt: skip
 
     def switch_at(self, times: tuple[float, ...]) -> None:
         """Search from now on for surfaces that take over at these times, s."""
