@@ -62,7 +62,10 @@ def test_never_worse_than_the_incumbent(
         )
 
 
-@pytest.mark.parametrize(("name", "degrees", "radius"), [("time", 23, 0.3), ("energy", 20, 0.01)])
+@pytest.mark.parametrize(
+    ("name", "degrees", "radius"),
+    [("time", 23, 0.3), pytest.param("energy", 20, 0.01, marks=pytest.mark.slow)],
+)
 def test_a_richer_set_of_variables_never_answers_worse(
     name: str, degrees: float, radius: float
 ) -> None:

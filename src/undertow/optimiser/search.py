@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cache
+from itertools import chain
 
 import numpy as np
 
@@ -105,24 +106,24 @@ def global_search(task: Optimisation) -> Iterator[bool]:
     What it allows this one allows, too: no answer is worse than that of a plainer set.  Yields
     for each answer whether it has converged.
     """
-    plainer, converged = task.plainer(), False
-    for converged in _own_search(task):
-        yield converged
+    plainer = task.plainer()
+    return chain(_own_search(task), _take_over(task, plainer))
+
+
+def _take_over(task: Optimisation, plainer: Optimisation | None) -> Iterator[bool]:
     if plainer is None or task.late():
         return
     before = task.best_cost
-    *_, done = global_search(plainer)
+    *_, converged = global_search(plainer)
     task.budget = Budget(task.budget.evaluations + plainer.budget.evaluations, task.budget.seconds)
     task.evaluations += plainer.evaluations
     task.minima.append(plainer.best_cost)
     if plainer.best is not None:
         task.consider(plainer.best)
     if task.best_cost < before:
-        converged = done
+        yield converged
         if task.optimiser.counts_time and task.optimiser.freedom.schedule:
-            for converged in follow_earliest(task):
-                yield converged
-    yield converged
+            yield from follow_earliest(task)
 
 
 def _own_search(task: Optimisation) -> Iterator[bool]:
