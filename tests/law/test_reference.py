@@ -150,6 +150,7 @@ def test_a_file_is_read_with_its_units(tmp_path: Path) -> None:
         ("t (s), x (m)\n0,0\n1\n", "line 3 of"),
         ("t (s), x (m)\n1,0\n0,1\n", "times of a reference"),
         ("t (s), x (m)\n0,0\n", "times of a reference"),
+        ("t (s), x (m)\n0,0\n1,1\n1,2\n", "times of a reference"),
         ("t (m), x (m)\n0,0\n1,1\n", "column 't .m.'.*one of s, ms"),
         ("x (m), y (m)\n0,0\n1,1\n", "column 'x .m.'.*one of s, ms"),
         ("t (s), x (ms)\n0,0\n1,1\n", "column 'x .ms.'.*one of m, cm"),
