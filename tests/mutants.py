@@ -12,7 +12,8 @@ sooner::
     python tests/mutants.py --package law --reached .coverage --near
 
 ``--near`` leaves all others out, but for those that name a module of compiled lines, which coverage
-does not see: what survives then may yet be killed by another test.
+does not see: what survives then may yet be killed by another test.  The data are of the tests as
+they stand: one that is gone would count as one that fails.
 """
 
 from __future__ import annotations

@@ -223,6 +223,7 @@ def test_the_picture_of_a_loop_shows_what_is_proved_and_what_falls(
     drawn = loop_figure(rig, ut.first_surface(rig), ut.ReachingLaw(), claim, "a pole on a cart")
     over_time, plane = drawn.axes
     assert (over_time.get_ylabel(), plane.get_ylabel()) == ("φ (°)", "dφ/dt (°/s)")
+    assert not claim.box(rig)[[0, 2, 3]].any()  # it starts with φ alone
     proved = np.degrees(claim.box(rig)[1, 1])
     bar, *_ = (line for line in over_time.lines if line.get_linewidth() > 2)
     assert np.max(bar.get_ydata()) == pytest.approx(proved)
