@@ -1,20 +1,30 @@
 """Mutants of the core: one change of one expression, and whether a test notices.
 
-``python tests/mutants.py --count 300`` changes 300 places, spread evenly over the files of law,
-closed loop and certificates, runs the tests of the package that was changed (then those of the
-packages that stand on it), and lists the mutants that survive.  ``--list`` shows them without
-running anything; a mutant comes out again with ``--seed N --only NUMBER``.
+``python tests/mutants.py --count 300`` changes 300 places, spread evenly over the core's files,
+runs the tests of the package that was changed (then those of the packages that stand on it), and
+lists the mutants that survive.  ``--list`` shows them without running anything; a mutant comes out
+again with ``--seed N --only NUMBER``.
+
+Where it is known which test reaches which line, a mutant meets those tests first, and is over
+sooner::
+
+    pytest tests/law --cov=undertow --cov-context=test --cov-report=     # writes .coverage
+    python tests/mutants.py --package law --reached .coverage --near
+
+``--near`` leaves all others out, but for those that name a module of compiled lines, which coverage
+does not see: what survives then may yet be killed by another test.  The data are of the tests as
+they stand: one that is gone would count as one that fails.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import multiprocessing
 import os
 import random
 import re
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
@@ -22,7 +32,11 @@ from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+
+import coverage
+import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "undertow"
@@ -31,8 +45,20 @@ PACKAGE = ROOT / "src" / "undertow"
 CORE = {
     "law": (("law",), ("closed_loop", "optimiser", "cascade")),
     "closed_loop": (("closed_loop",), ("optimiser", "cascade")),
+    "optimiser": (("optimiser",), ("cascade",)),
+    "estimators": (("estimators",), ("runtime",)),
+    "cascade": (("cascade",), ("runtime",)),
     "proofs": (("proofs",), ("studies",)),
 }
+
+#: The packages that stand on what is generated and compiled, and are no part of it.
+ABOVE = ("optimiser", "estimators", "proofs")
+
+#: What every run of tests imports, and no mutant changes: imported once, see :func:`outcome`.
+OTHERS = ["matplotlib.pyplot", "numba", "pytest", "scipy.optimize", "sympy", "typer"]
+
+SURVIVED = "SURVIVED"
+TOO_LONG = "ran out of time"
 
 #: Longest time of the tests of one package on one mutant, s: one that does not end is noticed, too,
 #: and is counted apart, for on a busy machine it may be one that nothing would notice.
@@ -168,33 +194,90 @@ def nearest(mutant: Mutant, names: tuple[str, ...]) -> list[str]:
     return [str(path.relative_to(ROOT)) for path in files if word.search(path.read_text())]
 
 
-def outcome(mutant: Mutant) -> str:
-    """Return what becomes of a mutant: killed, ran out of time or SURVIVED."""
+@lru_cache(maxsize=1)
+def _data(*files: str) -> tuple[coverage.CoverageData, ...]:
+    data = tuple(coverage.CoverageData(name) for name in files)
+    for one in data:
+        one.read()
+    return data
+
+
+def reaching(mutant: Mutant, files: tuple[str, ...]) -> list[str]:
+    """Return the tests that reach the statement that was changed, the narrowest first.
+
+    Coverage sees neither compiled code nor the second use of a value that is remembered: a test
+    that is not among them may notice the mutant, too.
+    """
+    nodes = ast.walk(ast.parse(mutant.file.read_bytes()))
+    spans = [_span(node) for node in nodes if isinstance(node, ast.stmt)]
+    first, last = max(span for span in spans if span[0] <= mutant.line <= span[1])
+    width, found = Counter[str](), set[str]()
+    for data in _data(*files):
+        for line, tests in data.contexts_by_lineno(str(mutant.file)).items():
+            names = {name.partition("|")[0] for name in tests if name}
+            width.update(names)
+            if first <= line <= last:
+                found |= names
+    return sorted(found, key=lambda name: (width[name], name))
+
+
+def _span(node: ast.stmt) -> tuple[int, int]:
+    """Return the first and the last line of a statement, without those that it holds."""
+    assert node.end_lineno is not None
+    body = getattr(node, "body", None)
+    return node.lineno, max(node.lineno, body[0].lineno - 1) if body else node.end_lineno
+
+
+def _judge(words: list[str], environment: dict[str, str]) -> None:
+    """Run tests in this process, and end with their exit status."""
+    os.environ |= environment
+    os.chdir(ROOT)
+    sys.path[:0] = [str(ROOT), environment["PYTHONPATH"]]
+    silence = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(silence, 1)
+    os.dup2(silence, 2)
+    os._exit(int(pytest.main(words)))
+
+
+def outcome(mutant: Mutant, reached: tuple[str, ...] = (), near: bool = False) -> str:
+    """Return what becomes of a mutant: killed, ran out of time or SURVIVED.
+
+    Its tests run in a process that is forked from one that has imported other people's packages.
+    """
     package = mutant.file.relative_to(PACKAGE).parts[0]
+    compiled = re.search(rb"njit|compiled\b", mutant.file.read_bytes())
+    turns = [reaching(mutant, reached)]
+    if near and compiled:
+        turns.append(nearest(mutant, CORE[package][0]))
+    elif not near:
+        turns += [
+            [*nearest(mutant, names), *(f"tests/{name}" for name in names)]
+            for names in CORE[package]
+        ]
     with tempfile.TemporaryDirectory(prefix="mutant-") as folder:
         tree = Path(folder) / "undertow"
         # What numba keeps of functions contains those that they call: none of it, if one changes.
-        compiled = b"njit" in mutant.file.read_bytes()
         shutil.copytree(
             PACKAGE, tree, ignore=shutil.ignore_patterns("*.nbi", "*.nbc") if compiled else None
         )
         (tree / mutant.file.relative_to(PACKAGE)).write_bytes(mutant.text())
-        environment = os.environ | {
-            "PYTHONPATH": folder, "UNDERTOW_CACHE": str(Path(tempfile.gettempdir()) / "mutants"),
-        }  # fmt: skip
-        for names in CORE[package]:
-            words = ["-x", "-q", "-p", "no:cacheprovider", "--hypothesis-seed=0"]
-            words += [*nearest(mutant, names), *(f"tests/{name}" for name in names)]
-            try:
-                done = subprocess.run(
-                    [sys.executable, "-m", "pytest", *words],
-                    cwd=ROOT, env=environment, capture_output=True, timeout=LIMIT, check=False,
-                )  # fmt: skip
-            except subprocess.TimeoutExpired:
-                return "ran out of time"
-            if done.returncode:
+        # So it does of generated modules, but for what stands above all of those.
+        own = compiled and package not in ABOVE
+        cache = Path(folder if own else tempfile.gettempdir()) / "mutants"
+        environment = {"PYTHONPATH": folder, "UNDERTOW_CACHE": str(cache)}
+        for tests in filter(None, turns):
+            words = ["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--hypothesis-seed=0"]
+            run = multiprocessing.get_context("forkserver").Process(
+                target=_judge, args=([*words, *tests], environment)
+            )
+            run.start()
+            run.join(LIMIT)
+            if run.is_alive():
+                run.kill()
+                return TOO_LONG
+            if run.exitcode not in (0, pytest.ExitCode.NO_TESTS_COLLECTED):
                 return "killed"
-    return "SURVIVED"
+    return SURVIVED
 
 
 def main() -> int:
@@ -205,6 +288,8 @@ def main() -> int:
     parser.add_argument("--package", choices=sorted(CORE), action="append", help="all by default")
     parser.add_argument("--only", type=int, action="append", help="number of a mutant")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
+    parser.add_argument("--reached", action="append", default=[], help="data of coverage")
+    parser.add_argument("--near", action="store_true", help="tests that reach or name it alone")
     parser.add_argument("--least", type=float, default=85.0, help="share to be killed, %%")
     parser.add_argument("--list", action="store_true", help="show them alone")
     asked = parser.parse_args()
@@ -215,15 +300,18 @@ def main() -> int:
             print(f"{number}: {mutant}")
         return 0
     began, found = time.monotonic(), Counter[str]()
+    multiprocessing.get_context("forkserver").set_forkserver_preload(OTHERS)
     with ThreadPoolExecutor(asked.jobs) as pool:
-        outcomes = pool.map(outcome, [mutant for _, mutant in numbered])
+        outcomes = pool.map(
+            lambda item: outcome(item[1], tuple(asked.reached), asked.near), numbered
+        )
         for done, ((number, mutant), word) in enumerate(zip(numbered, outcomes, strict=True), 1):
             found[word] += 1
             print(f"{done} of {len(numbered)}, {word}: #{number} {mutant}", flush=True)
-    killed = len(numbered) - found["SURVIVED"]
+    killed = len(numbered) - found[SURVIVED]
     share = 100 * killed / max(1, len(numbered))
     print(f"{killed} of {len(numbered)} mutants killed, {share:.0f} %, "
-          f"{found['ran out of time']} of them by time, seed {asked.seed}, "
+          f"{found[TOO_LONG]} of them by time, seed {asked.seed}, "
           f"{time.monotonic() - began:.0f} s")  # fmt: skip
     return 0 if share >= asked.least else 1
 

@@ -195,3 +195,12 @@ def test_the_travel_is_a_constraint_about_a_target_too() -> None:
     (leg,) = legs_to(cascade, ut.SetPoints({"x": 1.0}), 8.0)
     (travel,) = cascade.about(cascade.loop, leg.target, 0.0).objective.constraints
     assert "1.425 m" in travel.name
+
+
+def test_each_target_is_seen_from_itself() -> None:
+    """Of two targets in turn each has its own distance to the stops, of one structure."""
+    cascade = ut.Cascade(CRANE, ut.MinimumEnergy(horizon=8.0), belief="exact")
+    legs = [legs_to(cascade, ut.SetPoints({"x": x}), 8.0)[0] for x in (1.0, -0.5, 1.0)]
+    loops = [cascade.about(cascade.loop, leg.target, 0.0) for leg in legs]
+    assert [loop.mechanism.parameter_values[-1] for loop in loops] == [1.0, -0.5, 1.0]
+    assert [loop.mechanism.structure for loop in loops[1:]] == 2 * [loops[0].mechanism.structure]

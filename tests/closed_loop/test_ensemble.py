@@ -13,6 +13,7 @@ from undertow.base import InvalidInputError
 from undertow.closed_loop import INADMISSIBLE, Ensemble, Event
 from undertow.closed_loop.buffers import RolloutBuffers
 from undertow.closed_loop.ensemble import Risk, summarise
+from undertow.closed_loop.gate import cost_gate
 from undertow.closed_loop.work_array import LANES
 from undertow.law import SlidingModeLaw
 from undertow.models import FloatArray
@@ -315,3 +316,22 @@ def test_members_with_errors_of_surface_and_state(loop: ut.ClosedLoop, rig: ut.M
         Ensemble(rig, values, surface_errors=np.zeros((2, 3)))
     with pytest.raises(InvalidInputError, match="state_errors"):
         Ensemble(rig, values, state_errors=np.full((2, 4), np.nan))
+
+
+def test_of_two_plans_that_fail_the_gate_keeps_the_one_that_all_survive_longer(
+    loop: ut.ClosedLoop, base: ut.Surface, quick: ut.Surface
+) -> None:
+    """A plan that some plausible plant fails may yet save the true one; of one plant it cannot."""
+    x, plans = loop.mechanism.state(phi=0.9), (ut.Plan.of(quick), ut.Plan.of(base))
+    fails = loop.batch(x, list(plans))
+    assert not fails.reached.any()
+    assert fails.time[0] < fails.time[1]
+    shorter, longer = plans
+    admitted = cost_gate(loop, shorter, longer, x, HORIZON)
+    assert admitted.accepted
+    assert admitted.cost == math.inf
+    assert admitted.reason.endswith(f"but longer: singular at {fails.time[1]:.3g} s")
+    for judge, old, new in ((loop, longer, shorter), (replace(loop, ensemble=None), *plans)):
+        refused = cost_gate(judge, old, new, x, HORIZON)
+        assert not refused.accepted
+        assert refused.reason.startswith("not feasible from here: singular at")

@@ -188,3 +188,10 @@ def test_figures_become_files_of_each_kind(motion: ut.Trajectory) -> None:
     assert b"<svg" in files["one.svg"]
     assert b"<dc:date>" not in files["one.svg"]
     assert figures.motion_figure({"a": motion})._repr_png_() == files["one.png"]
+
+
+def test_what_the_style_does_not_say_is_the_users() -> None:
+    """A user's settings hold in our pictures, but for those that make the style."""
+    with mpl.rc_context({"lines.markersize": 11.0, "axes.grid": False}), figures.style():
+        assert mpl.rcParams["lines.markersize"] == 11.0
+        assert mpl.rcParams["axes.grid"]

@@ -14,7 +14,8 @@ from scipy.integrate import solve_ivp
 import undertow as ut
 from undertow.base import InvalidInputError
 from undertow.estimators import Belief
-from undertow.estimators.belief import EVEN, LEAST, SLIPS
+from undertow.estimators.belief import EVEN, LEAST, SLIP_OF_SURFACE, SLIPS
+from undertow.law import LawLayout
 from undertow.models import FloatArray
 
 SPREAD = {"m": 0.2, "l": 0.05, "I_e": 0.2, "a_e": 0.1, "d_e": 0.5}
@@ -263,3 +264,17 @@ def test_errors_of_state_are_small_beside_the_travel() -> None:
     np.testing.assert_allclose(slips(-1.5, 1.5)[:2], [2e-4, 2e-3])
     np.testing.assert_allclose(slips(-1e-4, 3e-4)[:2], [1e-6, 2e-3])
     np.testing.assert_allclose(slips(0.0, 3e-4)[:2], [3e-6, 2e-3])
+
+
+def test_errors_of_state_and_surface_come_in_pairs_of_one_size(belief: Belief) -> None:
+    """The members after the estimate have them, with either sign; α_a, which only scales, none."""
+    ensemble = belief.ensemble(belief.prior)
+    half = SLIPS // 2
+    for errors in (ensemble.surface_errors, ensemble.state_errors):
+        np.testing.assert_array_equal(errors[1 : 1 + half], -errors[1 + half : 1 + SLIPS])
+        assert not errors[0].any()
+        assert not errors[1 + SLIPS :].any()
+    alpha_a, *others = LawLayout(2, 1).blocks(ensemble.surface_errors)
+    assert not alpha_a.any()
+    for block in others:
+        assert (np.abs(block[1 : 1 + SLIPS]) == SLIP_OF_SURFACE).all()

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import undertow as ut
 from undertow.base import ArtefactError, InvalidInputError
@@ -22,6 +24,7 @@ from undertow.estimators import (
     compensated,
     run_recorded,
 )
+from undertow.estimators.recorded_run import subtract_disturbance
 from undertow.law import InnerLoop
 from undertow.plants import Bench, IdealRig, Measurement, RealisticRig, Timing, srv02_rig
 from undertow.runtime import Recipe
@@ -67,6 +70,29 @@ def test_super_twisting_is_exact_below_its_bound_and_not_above(arm: ut.Mechanism
 def test_super_twisting_does_not_chatter_on_a_still_encoder(arm: ut.Mechanism) -> None:
     v = _follow(SuperTwisting(arm, acceleration=500.0), lambda t: 0.3, 0.5)
     assert not v.any()
+
+
+@pytest.mark.parametrize(
+    "make", [lambda arm: FilteredDerivative(arm, time_constant=0.002), SuperTwisting]
+)
+def test_without_a_reading_a_coordinate_goes_on_at_its_last_velocity(
+    make: Callable[[ut.Mechanism], Estimator], arm: ut.Mechanism
+) -> None:
+    """Of a ramp that is not seen for a while nothing is missed, and nothing jumps afterwards."""
+    estimator, slope = make(arm), -0.7
+    estimator.reset([0.0, 0.0, slope, slope])
+    for k in range(1, 400):
+        q = np.full(2, slope * k * PERIOD)
+        seen = np.where([True, k < 200 or k > 300], q, np.nan)
+        x = estimator.estimate(Measurement(k * PERIOD, seen), np.zeros(1))
+        np.testing.assert_allclose(x, [*q, slope, slope], atol=1e-9)
+
+
+def test_who_knows_no_covariance_says_so_in_the_right_shape(arm: ut.Mechanism) -> None:
+    """No part of the state is uncertain: what is planned with it takes no risk into account."""
+    estimator = Measured(arm)
+    for covariance in (estimator.steady_covariance(), estimator.noise_covariance()):
+        np.testing.assert_array_equal(covariance, np.zeros((4, 4)))
 
 
 def test_the_kalman_filter_finds_the_state_of_its_own_model(arm: ut.Mechanism) -> None:
@@ -297,3 +323,18 @@ def test_what_is_no_estimator_is_refused_at_the_door(arm: ut.Mechanism) -> None:
     for made in (Alike, lambda: _AlphaBeta.__new__(_AlphaBeta)):
         with pytest.raises(InvalidInputError, match=r"estimator of a run.*Derive your own"):
             Recipe(arm, start=(0, 0.1, 0, 0), estimator=lambda *_, made=made: made()).cascade  # noqa: B018
+
+
+@given(
+    st.lists(st.floats(-1e300, 1e300), min_size=2, max_size=2),
+    st.lists(st.floats(-1e300, 1e300), min_size=2, max_size=2),
+)
+def test_what_is_taken_off_keeps_to_its_share_and_to_the_limits(
+    u: list[float], disturbance: list[float]
+) -> None:
+    limits, out = np.array([2.0, math.inf]), np.zeros(2)
+    subtract_disturbance(np.array(u), np.array(disturbance), limits, out)
+    assert abs(out[0]) <= 2.0
+    free = min(max(u[0] - min(max(disturbance[0], -1.0), 1.0), -2.0), 2.0)
+    assert out[0] == free
+    assert out[1] == u[1] - disturbance[1]

@@ -27,12 +27,15 @@ from undertow.base import (
     MissingExtraError,
     ModelError,
     UnstableSurfaceError,
+    as_text,
 )
 from undertow.cli import app
 from undertow.export import (
+    Agreement,
     Build,
     DerivativeStep,
     EmbeddedController,
+    Footprint,
     KalmanStep,
     PlanAnswer,
     Status,
@@ -41,13 +44,21 @@ from undertow.export import (
     files,
 )
 from undertow.export.controller import checksums, plan_numbers
-from undertow.export.host import FLAGS, run_on_rig, tool
+from undertow.export.host import FLAGS, NEAREST, run_on_rig, tool
 from undertow.export.routh import characteristic_polynomial
 from undertow.export.twin import run_positions
 from undertow.law import Plan, sliding_matrix, stability_margin
 from undertow.mechanisms import LIBRARY
 from undertow.plants import RealisticRig, plausible_rig, srv02_rig
-from undertow.studies.rigs.export import upset_every_bit
+from undertow.studies.rigs.export import (
+    ExportRow,
+    Upsets,
+    notes,
+    tables,
+    upset_every_bit,
+    upsets_table,
+)
+from undertow.studies.rigs.export import csv as export_csv
 from undertow.symbolic import C99Emitter, Tape, literal
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
@@ -670,6 +681,43 @@ def test_an_output_beyond_its_limit_is_counted(tmp_path: Path) -> None:
     rig = RealisticRig(srv02_rig(), controller.mechanism.state(phi=0.3), seed=0)
     upsets = upset_every_bit(build, rig, moments=(0.05,), after=0.05, every=3)
     assert upsets.beyond["u"] > 0
+
+
+def test_what_became_of_the_upsets_is_told_by_member_and_in_all() -> None:
+    """A member without a run has no line; a run that falls without an upset is not held against."""
+    runs, beyond, held = (
+        {"u": 4, "spare": 0, "q": 16},
+        {"u": 3, "spare": 0, "q": 0},
+        {"u": 1, "q": 9},
+    )
+    upsets = Upsets("a rig", "float", 96, (0.05, 2.0), True, runs, beyond, held | {"spare": 0})
+    said = str(upsets)
+    assert "20 runs" in said
+    assert "at 0.05, 2 s: output beyond its limit in 3; still balanced 10 (50.0%)." in said
+    assert str(replace(upsets, undisturbed=False)).endswith(
+        "but so is not the run without an upset."
+    )
+    lines = [line.split() for line in as_text(upsets_table(upsets)).decode().splitlines()]
+    assert ["u", "4", "3", "25.0%"] in lines
+    assert ["q", "16", "0", "56.2%"] in lines
+    assert not any(line[:1] == ["spare"] for line in lines)
+
+
+def test_the_report_of_an_export_has_a_line_for_each_controller() -> None:
+    """Its own test that fails is said as such; all numbers are in the file."""
+    near, cost = Agreement(9, 1, 1e-15, 2e-15, 3e-15, 4e-15), Footprint(99.6, 1, 2, 3, 4, ("sin",))
+    rows = [ExportRow(exported(name), name != M, "", near, cost) for name in ("rotary_pendulum", M)]
+    agrees, costs = (as_text(one).decode().splitlines() for one in tables(rows))
+    assert any(line.split()[:5] == [M, "3", "2", "FAILED", "1.0e-15"] for line in agrees)
+    assert any(
+        line.split() == ["rotary_pendulum", "100", "1", "2", "3", "4", "sin"] for line in costs
+    )
+    first, second = csv.DictReader(export_csv(rows).decode().splitlines())
+    assert (first["own test"], second["own test"]) == ("passed", "FAILED")
+    assert (first["margin"], second["calls"]) == ("4.0e-15", "sin")
+    assert ["left out" in " ".join(notes(real, 9, "gcc")) for real in ("float", "double")] == [
+        NEAREST[real] > 0 for real in ("float", "double")
+    ]
 
 
 # -- plans ---------------------------------------------------------------------------------------

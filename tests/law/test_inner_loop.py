@@ -63,6 +63,23 @@ def test_a_reaching_law_is_exchanged_with_the_surface_or_stays(
     assert law_memory(rig)["limits"] == [rig.inputs[0].limit]
 
 
+def test_along_a_plan_the_surface_in_force_is_obeyed(
+    rig: ut.Mechanism, base: ut.Surface, quick: ut.Surface
+) -> None:
+    """With the plan's reaching law where it has one for the surface, or else with the other one."""
+    x, soft, other = (
+        rig.state(phi=0.02, theta=0.1),
+        ut.ReachingLaw(3.0, 0.5),
+        ut.ReachingLaw(8.0, 0.2),
+    )
+    for laws in (None, (soft, soft)):
+        plan, law = ut.Plan((base, quick), (0.0, 0.5), laws), InnerLoop(rig, base)
+        for elapsed, surface in ((0.1, base), (0.6, quick), (0.2, base)):
+            law.follow(plan, elapsed, other)
+            wanted = ut.SlidingModeLaw(rig, surface, soft if laws else other)(0.0, x).u[0]
+            assert law(x)[0] == pytest.approx(float(wanted))
+
+
 def test_no_state_brings_the_input_past_its_limits_or_to_nan(
     rig: ut.Mechanism, base: ut.Surface
 ) -> None:
@@ -105,6 +122,17 @@ def test_parameters_with_which_the_input_would_turn_are_not_taken_over() -> None
     np.testing.assert_array_equal(law.parameters, learnt)
     law.parameters[:] = rig.parameter_values
     assert law.believe(learnt, rig.state(phi=ut.deg(60)))  # singular in any case
+
+
+@pytest.mark.parametrize("name", ["rotary_pendulum", "two_motor_three_link"])
+def test_near_the_target_the_law_is_its_linear_feedback(name: str) -> None:
+    """u = k x to second order in x, for every coordinate and rate and every input."""
+    mechanism = ut.mechanisms.LIBRARY[name]()
+    law = ut.SlidingModeLaw(mechanism, ut.first_surface(mechanism))
+    k = feedback_at_target(mechanism, law.surface)
+    assert k.shape == (mechanism.m, 2 * mechanism.n)
+    for x in np.random.default_rng(0).normal(0.0, 1e-6, (20, 2 * mechanism.n)):
+        np.testing.assert_allclose(law(0.0, x).demand, k @ x, atol=1e-4 * np.abs(k).max() * 1e-6)
 
 
 def test_what_is_kept_for_all_is_read_only(rig: ut.Mechanism, base: ut.Surface) -> None:

@@ -14,6 +14,7 @@ import undertow as ut
 from undertow.base import ArtefactError, InvalidInputError
 from undertow.closed_loop import Event, simulate_along
 from undertow.law import Plan, ReferenceMotion
+from undertow.law.reference import Ramp, Sine, Spline
 from undertow.models import error_dynamics, invariant_coordinates
 
 RIG = ut.mechanisms.rotary_pendulum()
@@ -150,6 +151,7 @@ def test_a_file_is_read_with_its_units(tmp_path: Path) -> None:
         ("t (s), x (m)\n0,0\n1\n", "line 3 of"),
         ("t (s), x (m)\n1,0\n0,1\n", "times of a reference"),
         ("t (s), x (m)\n0,0\n", "times of a reference"),
+        ("t (s), x (m)\n0,0\n1,1\n1,2\n", "times of a reference"),
         ("t (m), x (m)\n0,0\n1,1\n", "column 't .m.'.*one of s, ms"),
         ("x (m), y (m)\n0,0\n1,1\n", "column 'x .m.'.*one of s, ms"),
         ("t (s), x (ms)\n0,0\n1,1\n", "column 'x .ms.'.*one of m, cm"),
@@ -162,6 +164,27 @@ def test_a_file_that_is_no_reference_is_refused(tmp_path: Path, text: str, words
     file.write_text(text, encoding="utf-8")
     with pytest.raises(InvalidInputError, match=words):
         ut.Reference.read(file)
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        Ramp(0.3, -0.5, 0.2, 1.6),
+        Sine(0.4, 0.7, 0.3, 1.0),
+        Spline((0.0, 0.5, 2.0), (0.1, -0.4, 0.6)),
+    ],
+)
+def test_rates_of_a_path_are_its_derivatives(path: Ramp | Sine | Spline) -> None:
+    """By central differences, before, along and after it; what has ends is at rest there."""
+    t, h = np.linspace(-0.33, 2.4, 90), 1e-5
+    before, (_, v, a), after = (path(t + step) for step in (-h, 0.0, h))
+    np.testing.assert_allclose((after[0] - before[0]) / (2 * h), v, atol=1e-6)
+    np.testing.assert_allclose((after[1] - before[1]) / (2 * h), a, atol=1e-5)
+    if not isinstance(path, Sine):
+        first, last = (0.3, -0.5) if isinstance(path, Ramp) else (0.1, 0.6)
+        r, *rates = path(t[[0, -1]])
+        np.testing.assert_allclose(r, [first, last])
+        np.testing.assert_allclose(rates, 0.0, atol=1e-12)
 
 
 def test_references_are_refused_by_name() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from itertools import pairwise
 
@@ -124,6 +125,17 @@ def test_rotated_ellipsoid_costs_no_more() -> None:
     plain = np.median([evaluations_to(ellipsoid, 5, 1e-8, s) for s in range(7)])
     turned = np.median([evaluations_to(lambda x: ellipsoid(x @ q), 5, 1e-8, s) for s in range(7)])
     assert turned <= 1.25 * plain
+
+
+@pytest.mark.parametrize(("d", "population", "extra"), [(10, 10, False), (2, 200, True)])
+def test_the_step_size_is_damped_more_only_with_many_candidates(
+    d: int, population: int, extra: bool
+) -> None:
+    """(55): d_σ = 1 + c_σ, and beyond that where the effective number of parents exceeds d + 2."""
+    search = CMAES(np.zeros(d), 1.0, population, np.random.default_rng(0))
+    assert (search.mu_eff > d + 2) == extra
+    more = math.sqrt((search.mu_eff - 1) / (d + 1)) - 1 if extra else 0.0
+    assert search.d_sigma == 1 + 2 * more + search.c_sigma
 
 
 def test_same_seed_same_bits() -> None:

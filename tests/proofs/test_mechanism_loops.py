@@ -49,6 +49,15 @@ def test_mechanisms_of_several_sizes_have_kept_claims() -> None:
     assert 2 in {m for _, m in sizes}
 
 
+def test_a_file_tells_the_parameters_and_limits_that_it_is_about() -> None:
+    """Those that are zero, too."""
+    rig = ut.mechanisms.reaction_wheel_pendulum()
+    certificate = read_certificate(KEPT["reaction_wheel_pendulum"])
+    assert certificate.parameters == {p.name: p.value for p in rig.parameters}
+    assert 0.0 in certificate.parameters.values()
+    assert certificate.input_limits == tuple(rig.input_limits)
+
+
 def proved(name: str) -> None:
     items = verify(read_certificate(KEPT[name]), ut.mechanisms.LIBRARY[name]())
     assert items

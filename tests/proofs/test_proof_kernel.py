@@ -23,8 +23,9 @@ from undertow.proofs.claims.document import document_bytes
 from undertow.proofs.claims.model_data import law_of, model_data, model_of
 from undertow.proofs.claims.verify import verify
 from undertow.proofs.kernel import claims as kernel
+from undertow.proofs.kernel import words
 from undertow.proofs.kernel.claims import Nonsingular, Reaching, Stability, check, decide
-from undertow.proofs.kernel.model import Law, Model
+from undertow.proofs.kernel.model import Law, Model, Quantity
 from undertow.proofs.kernel.reader import Refused, digest, number, number_text, read, read_model
 
 ROOT = Path(__file__).parents[2]
@@ -310,6 +311,23 @@ def test_an_equilibrium_that_is_off_is_seen_however_little(shift: float) -> None
     assert "f_u(0, 0) = 0" in found.why
     home = model_of(changed(nothing, "home"))
     assert decide(home, law, Stability(Fraction(0))).kind == "proved"
+
+
+@pytest.mark.parametrize(
+    ("ends", "said"),
+    [
+        ((0, 0), "at the target"),
+        ((-0.125, 0.125), "for |phi| ≤ 0.125 rad"),
+        ((0, 0.125), "for phi in [0, 0.125] rad"),
+        ((-0.125, 0), "for phi in [-0.125, 0] rad"),
+    ],
+)
+def test_a_region_on_one_side_of_the_target_is_said(ends: tuple[float, float], said: str) -> None:
+    """A claim for starts on one side would else read as one for the target alone."""
+    positions = Quantity("theta", "rad"), Quantity("phi", "rad")
+    box = {"theta": (Fraction(0), Fraction(0)), "phi": (Fraction(ends[0]), Fraction(ends[1]))}
+    rest = ", the other coordinates at the target" if any(ends) else ""
+    assert words.region(positions, box) == said + rest
 
 
 def test_a_file_has_no_sentence_to_believe() -> None:

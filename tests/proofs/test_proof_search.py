@@ -25,6 +25,7 @@ from undertow.base import Verdict
 from undertow.base.errors import InfeasibleError
 from undertow.models import FloatArray
 from undertow.proofs.claims.region import reaches
+from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
 from undertow.proofs.region.lyapunov import (
     LyapunovFunction,
     directions,
@@ -39,6 +40,7 @@ from undertow.proofs.search.chart import natural_stretch, singular_distance_on_a
 from undertow.proofs.search.linear_program import minimise_linear
 from undertow.proofs.search.quadratic import quadratic
 from undertow.proofs.search.region import LEAP, TIGHT, _proved_chain, _tight_level
+from undertow.proofs.search.terminal_ellipsoid import EllipsoidSearch
 from vector_field import VectorField
 
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.025)
@@ -383,3 +385,26 @@ def test_a_level_is_raised_to_within_two_per_cent_of_what_is_proved(edge: float)
     assert min(refused) <= TIGHT * level * (1 + 1e-9)
     assert refusal.kind == "undecided"
     assert len(decide.asked) < 20
+
+
+# -- terminal ellipsoids ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("slow_room", "alike"), [(1.0, True), (5.0, False)])
+def test_slow_modes_have_room_where_alike_nothing_is_proved(slow_room: float, alike: bool) -> None:
+    """Rates 1/s and 100/s; the proof asks for a slow semi-axis so many times the fast one."""
+
+    def axes(candidate: TerminalEllipsoid) -> FloatArray:
+        return np.asarray(candidate.radius / np.abs(np.diag(candidate.W)))
+
+    def margin(candidate: TerminalEllipsoid) -> float:
+        slow, fast = axes(candidate)
+        return 1.0 if slow >= slow_room * fast and slow <= 0.3 else -1.0
+
+    search = EllipsoidSearch.of(margin, np.diag([-1.0, -100.0]), np.eye(2), np.ones(2))
+    assert search is not None
+    found = search.largest(0)
+    assert found is not None
+    slow, fast = axes(found)
+    assert 0.3 / 1.01 <= slow <= 0.3
+    assert fast == pytest.approx(slow if alike else slow / 10)  # by the root of the rates

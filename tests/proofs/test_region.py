@@ -301,6 +301,11 @@ def test_functions_that_cannot_be_lyapunov_functions_are_refused() -> None:
         search_region(unstable, (1, 0, 0), programs=1)
 
 
+def test_a_surface_of_another_size_is_refused() -> None:
+    with pytest.raises(InvalidInputError, match=r"surface for 'rotary_pendulum'.*n = 3, m = 2"):
+        SurfaceMotion(RIG, ut.first_surface(ut.mechanisms.two_motor_three_link()))
+
+
 def test_a_dead_actuated_coordinate_is_refused() -> None:
     """λ_a = 0: w does not exist and θ would not converge."""
     with pytest.raises(InvalidInputError, match="λ_a"):

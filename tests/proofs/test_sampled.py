@@ -31,6 +31,7 @@ def test_the_bound_on_failures_covers() -> None:
         bounds = {k: failure_bound(int(k), 500, 0.95) for k in np.unique(counts)}
         missed = np.mean([bounds[k] < p for k in counts])
         assert missed <= 0.05 + 3 * np.sqrt(0.05 * 0.95 / 2000)
+    assert failure_bound(7, 7) == 1.0  # of what never succeeds nothing is known
     with pytest.raises(InvalidInputError):
         failure_bound(3, 2)
 

@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 import undertow as ut
 from undertow.base import Verdict
 from undertow.cli import app
+from undertow.closed_loop.figures import COLOURS
 from undertow.proofs import LoopClaim, RegionClaim, read_certificate
 from undertow.proofs.gate import GatePolicy, certified_gate
 from undertow.proofs.region.lyapunov import LyapunovFunction
@@ -28,6 +29,7 @@ from undertow.studies.certification import (
     certify_run,
     decide,
     figures,
+    loop_figure,
     region_figure,
     run_report,
     subject_report,
@@ -206,3 +208,31 @@ def test_the_picture_of_a_region_has_the_input_limit_in(monkeypatch: pytest.Monk
         fastest.append(drawn.axes[0].get_ylim()[1])
     assert fastest[1] < 0.5 * fastest[0]
     assert fastest[0] < 3000  # °/s
+
+
+def test_the_picture_of_a_loop_shows_what_is_proved_and_what_falls(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A kept claim of a pole on a cart: proved starts are as wide as it says, horizontal falls."""
+    monkeypatch.setattr(figures, "STARTS", 12)
+    monkeypatch.setattr(figures, "FOLLOWED", 5.0)
+    rig = ut.mechanisms.cart_pendulum()
+    path = Path(__file__).parents[1] / "data/mechanism_loops/cart_pendulum.json"
+    data = json.loads(path.read_text())["subjects"][0]["claims"][0]
+    claim = LoopClaim({name: value for name, value in data.items() if name != "kind"})
+    drawn = loop_figure(rig, ut.first_surface(rig), ut.ReachingLaw(), claim, "a pole on a cart")
+    over_time, plane = drawn.axes
+    assert (over_time.get_ylabel(), plane.get_ylabel()) == ("φ (°)", "dφ/dt (°/s)")
+    assert not claim.box(rig)[[0, 2, 3]].any()  # it starts with φ alone
+    proved = np.degrees(claim.box(rig)[1, 1])
+    bar, *_ = (line for line in over_time.lines if line.get_linewidth() > 2)
+    assert np.max(bar.get_ydata()) == pytest.approx(proved)
+    motions = [line for line in over_time.lines if line is not bar]
+    for line in motions[:-1]:
+        proved_start = np.asarray(line.get_ydata())[0] <= proved * (1 + 1e-9)
+        assert line.get_color() == COLOURS["blue" if proved_start else "sky"]
+    assert sum(line.get_color() == COLOURS["blue"] for line in motions) == 2
+    assert motions[-1].get_color() == COLOURS["vermilion"]
+    assert np.abs(motions[-1].get_ydata()).max() > 90
+    assert "|force| ≤ 20 N" in drawn.get_suptitle()
+    assert "renewed at every instant" in drawn.get_suptitle()

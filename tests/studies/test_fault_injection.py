@@ -17,6 +17,7 @@ from undertow.runtime import Columns, InlineWorker, Recipe, Runtime, SimulatedCl
 from undertow.runtime.recording import read_log
 from undertow.studies.fault_injection.cases import CASES, Case, OutputMonitor
 from undertow.studies.fault_injection.live import (
+    LIVE,
     KillResult,
     _ending,
     kill_drill,
@@ -172,6 +173,13 @@ def test_a_rig_that_fails_gives_the_verdict_and_exit_code_it_should(
 ) -> None:
     outcome = short(case("rig", name), tmp_path, 0.9)
     assert (outcome.verdict.ending, outcome.verdict.exit_code) == (ending, code)
+
+
+def test_a_run_whose_log_cannot_be_made_does_not_begin() -> None:
+    """The one case of the live part that takes no time."""
+    said, passed = LIVE["log", "cannot be made"]()
+    assert passed
+    assert said.startswith("refused before the run: ")
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ import pytest
 from scipy.stats import binomtest
 from typer.testing import CliRunner
 
-from undertow.base import ArtefactError, InvalidInputError
+from undertow.base import ArtefactError, InvalidInputError, as_text
 from undertow.cli import app
 from undertow.mechanisms import LIBRARY
 from undertow.models import linearise
@@ -22,7 +22,7 @@ from undertow.studies.campaign import Campaign, Definition, compute, dataset, ex
 from undertow.studies.campaign.definition import Settings
 from undertow.studies.campaign.entrants import FAULTS, ForfeitError, Refereed
 from undertow.studies.campaign.league import TASKS, League, home
-from undertow.studies.campaign.league_report import median_interval, wilson
+from undertow.studies.campaign.league_report import median_interval, tables, wilson
 from undertow.studies.campaign.run import study_of
 
 pytest.importorskip("zarr")
@@ -251,6 +251,46 @@ def test_intervals_are_those_of_scipy_and_hold_what_they_say() -> None:
         inside += low <= 0.0 <= high
     assert 0.88 <= inside / 200 <= 1.0
     assert math.isnan(median_interval(np.zeros(0))[0])
+
+
+def test_most_runs_won_come_first_and_of_equals_the_cheaper() -> None:
+    """Costs count where a run was won, over hindsight's; nobody is first where none won."""
+    import xarray
+
+    won = np.ones((2, 4, 1, 2), dtype=int)  # mechanism, entrant, task, plant
+    cost = np.full(won.shape, 2.0)
+    cost[0, 1:, 0, 0] = 6.0, 4.0, 2.0
+    cost[0, 1:, 0, 1] = 8.0, 4.0, 2.0
+    won[0, 3, 0, 0] = 0  # the cheapest loses a run
+    won[1, 1:] = 0
+    won[1, 1, 0, 1] = -1  # not finished
+    words = {"mechanism": "easy too_hard", "entrant": "hindsight dear fair cheap", "task": "exact"}
+    shape = ("mechanism", "entrant", "task", "plant")
+    zeros = np.zeros(won.shape)
+    fault = zeros.copy()
+    fault[1, 2, 0, 0] = 1
+    data = xarray.Dataset(
+        {"won": (shape, won), "cost": (shape, cost), "fault": (shape, fault),
+         "step_mean": (shape, zeros + 2e-6), "step_most": (shape, zeros + 5e-3)},
+        {name: (name, range(len(text.split())), {"flag_meanings": text})
+         for name, text in words.items()},
+    )  # fmt: skip
+    scores, tasks, mechanisms, best = (as_text(one).decode() for one in tables(data))
+    rows = [line.split() for line in scores.splitlines()]
+    first, second, third = (row for row in rows if row[:1] in (["dear"], ["fair"], ["cheap"]))
+    assert first[:4] == ["dear", "2", "of", "3"]
+    assert first[5] == "3.50"
+    assert second[:4] == ["fair", "2", "of", "4"]
+    assert third[:4] == ["cheap", "1", "of", "4"]
+    assert third[5] == "1.00"
+    assert first[-2:] == ["2", "5.0"]
+    assert "forfeited runs: fair in 1" in scores
+    assert next(x.split() for x in tasks.splitlines() if "exact" in x)[1:] == ["67", "50", "25"]
+    assert next(x.split() for x in mechanisms.splitlines() if "easy" in x)[1:] == [
+        "100", "100", "50",
+    ]  # fmt: skip
+    assert next(x.split() for x in best.splitlines() if "easy" in x)[1:] == ["fair"]
+    assert next(x.split() for x in best.splitlines() if "too hard" in x)[2:] == ["—"]
 
 
 def test_a_referee_names_what_was_wrong() -> None:

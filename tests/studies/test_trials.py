@@ -3,25 +3,33 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 import undertow as ut
-from undertow.base import ArtefactError
+from undertow.base import ArtefactError, as_text
 from undertow.estimators import Record
-from undertow.estimators.recorded_run import subtract_disturbance
 from undertow.objective import objective_for
 from undertow.plants import Bench, Friction, Push, srv02_rig
 from undertow.runtime.controller_defaults import estimator_for
 from undertow.studies.experiment import grouped
 from undertow.studies.ledger import Ledger
+from undertow.studies.trials import robustness
 from undertow.studies.trials.balance import Balance, controllers
-from undertow.studies.trials.report import balance_files, balance_report
+from undertow.studies.trials.estimation import EstimatorRow
+from undertow.studies.trials.report import (
+    balance_files,
+    balance_report,
+    engine_report,
+    estimator_report,
+    robustness_report,
+    swing_report,
+)
 from undertow.studies.trials.robustness import breaking_point, random_bench
 from undertow.studies.trials.steering import (
     CascadeSteering,
@@ -30,6 +38,7 @@ from undertow.studies.trials.steering import (
     predictive,
 )
 from undertow.studies.trials.trial import Outcome, Result, judge, spread, trial
+from undertow.studies.trials.upright import EngineResult, SwingResult
 
 
 @pytest.fixture(scope="module")
@@ -130,6 +139,99 @@ def test_a_breaking_point_is_bracketed_with_the_seed_that_breaks_it() -> None:
     assert (unbroken.survived, unbroken.seed) == (2.0, None)
 
 
+#: What each factor changes of a bench, from nothing, in the unit of its largest change.
+MEASURED: dict[str, Callable[[Bench], float]] = {
+    "Coulomb friction of the arm": lambda bench: bench.friction["theta"].coulomb,
+    "delay in all": lambda bench: bench.timing.input_delay + bench.timing.measurement_delay,
+    "pendulum and arm heavier": lambda bench: _mass(bench) / _mass(srv02_rig()) - 1,
+    "pendulum and arm lighter": lambda bench: 1 - _mass(bench) / _mass(srv02_rig()),
+    "knock on the pendulum": lambda bench: bench.pushes[-1].impulse,
+}
+
+
+def _mass(bench: Bench) -> float:
+    return next(p.value for p in bench.mechanism.parameters if p.name == "m")
+
+
+@pytest.mark.parametrize("factor", robustness.FACTORS)
+def test_what_breaks_a_controller_is_the_change_that_is_named(
+    factor: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A controller that fails beyond a limit breaks there, to 1/32 of the largest change tried."""
+    largest = robustness.FACTORS[factor][1]
+    limit = 0.4 * largest
+
+    def run(name: str, truth: Bench, seconds: float, seed: int) -> Result:
+        return result(seed, balanced=MEASURED[factor](truth) <= limit)
+
+    monkeypatch.setattr(robustness, "run", run)
+    found = robustness.broken_by("anybody", factor)
+    assert found.survived <= limit < found.broken
+    assert found.broken - found.survived == pytest.approx(largest / 32)
+
+
+def test_all_controllers_meet_the_same_random_rigs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The task of a controller and a seed is its run on that seed's rig, which it is not told."""
+    monkeypatch.setattr(robustness, "SECONDS", 0.2)
+    tasks = robustness.robustness(2)
+    random = {key for key in tasks if key[1] == robustness.RANDOM}
+    assert {key[2] for key in random} == {0, 1}
+    assert len(tasks) == len(random) + len(random) / 2 * len(robustness.FACTORS)
+    name, bench = "clipped LQR", srv02_rig()
+    belief = bench.mechanism
+    alone = trial(
+        belief, random_bench(bench, 1), clipped_regulator(belief),
+        belief.state(phi=robustness.ANGLE), 0.2, 1,
+        objective=objective_for(belief, "bench-energy"), told=bench,
+    ).numbers  # fmt: skip
+    assert tasks[name, robustness.RANDOM, 1]() == alone
+    assert tasks[name, robustness.RANDOM, 0]() != alone
+
+
+def result(seed: int = 0, *, balanced: bool = True, cost: float = 1.0) -> Result:
+    return Result(seed, balanced, True, 2.0, cost, 3.0, 4.0)
+
+
+def test_costs_are_compared_on_the_rigs_that_every_controller_balanced() -> None:
+    """Else who balances the hard ones too would be the dearer one."""
+    found: dict[tuple[str, str], list[Any]] = {
+        ("cascade", robustness.RANDOM): [result(cost=7.0), result(cost=99.0)],
+        ("clipped LQR", robustness.RANDOM): [result(cost=8.0), result(balanced=False)],
+        ("cascade", "delay in all"): [robustness.Breaking(0.016, 0.017, 2)],
+        ("clipped LQR", "delay in all"): [robustness.Breaking(0.032, math.inf, None)],
+    }
+    lines = as_text(robustness_report(found)).decode().splitlines()
+    first, second = (next(x for x in lines if x.split()[:1] == [w]) for w in ("cascade", "clipped"))
+    assert first.split()[1:4] == ["2", "2", "7.00"]
+    assert second.split()[2:5] == ["1", "2", "8.00"]
+    assert any("all of them balanced: 1" in line for line in lines)
+    delay = next(line for line in lines if "delay in all, ms" in line)
+    assert delay.split()[-4:] == ["16", "(2)", "≥", "32"]
+
+
+def test_reports_count_what_was_balanced_in_the_units_of_the_coordinates() -> None:
+    """Degrees and millimetres; what never happened has no time."""
+    runs = result(), result(balanced=False)
+    swings = [
+        SwingResult("acrobot", (), runs, (1.5, 2.5, 4.0), 1, 0),
+        SwingResult("pendubot", (), runs, (), 0, 2),
+    ]
+    text = as_text(swing_report(swings)).decode()
+    acrobot, pendubot = (
+        next(line.split() for line in text.splitlines() if name in line)
+        for name in ("acrobot", "pendubot")
+    )
+    assert acrobot[1:] == ["1", "of", "2", "2.50", "4.00", "1", "0"]
+    assert pendubot[4:] == ["nan", "nan", "0", "2"]
+    final = np.array([0.002, math.radians(0.5)])
+    text = as_text(engine_report([EngineResult("cart_pendulum", result(), final, 3)])).decode()
+    assert "2.0 mm, 0.50°" in text
+    row = EstimatorRow("a filter", 3, 4, np.array([0.5, 0.25]), 1.0, 2.0, math.nan)
+    text = as_text(estimator_report([row])).decode()
+    words = next(line.split() for line in text.splitlines() if "a filter" in line)
+    assert words == ["a", "filter", "3", "of", "4", "0.5000", "0.2500", "1.00", "2", "—"]
+
+
 def test_random_benches_stay_within_what_is_declared() -> None:
     bench = srv02_rig()
     benches = [random_bench(bench, seed) for seed in range(60)]
@@ -193,21 +295,6 @@ def test_the_observed_disturbance_frees_an_arm_that_stiction_holds(arm: ut.Mecha
         ends.append(float(np.abs(run.record.truth[-1000:, 0]).max()))
     assert ends[0] > 0.3
     assert ends[1] < 0.15
-
-
-@given(
-    st.lists(st.floats(-1e300, 1e300), min_size=2, max_size=2),
-    st.lists(st.floats(-1e300, 1e300), min_size=2, max_size=2),
-)
-def test_what_is_taken_off_keeps_to_its_share_and_to_the_limits(
-    u: list[float], disturbance: list[float]
-) -> None:
-    limits, out = np.array([2.0, math.inf]), np.zeros(2)
-    subtract_disturbance(np.array(u), np.array(disturbance), limits, out)
-    assert abs(out[0]) <= 2.0
-    free = min(max(u[0] - min(max(disturbance[0], -1.0), 1.0), -2.0), 2.0)
-    assert out[0] == free
-    assert out[1] == u[1] - disturbance[1]
 
 
 @pytest.mark.slow

@@ -180,12 +180,9 @@ def _row(what: str, values: ArrayLike, size: int) -> list[float]:
 
 
 def _at_target(mechanism: Mechanism, surface: Surface) -> FloatArray:
-    """Return |W| at the target, (m, n): where a search begins."""
-    m, M = mechanism.m, mechanism.M(np.zeros(mechanism.n))
-    X = np.linalg.solve(M[m:, m:], M[m:, :m])
-    W_a = (surface.alpha_a - surface.alpha_u @ X) @ np.linalg.inv(M[:m, :m] - M[:m, m:] @ X)
-    W_u = surface.alpha_u @ np.linalg.inv(M[m:, m:]) - W_a @ X.T
-    return np.asarray(np.abs(np.hstack([W_a, W_u])))
+    """Return |W| = |(α_a, α_u) M⁻¹| at the target, (m, n): where a search begins."""
+    n = mechanism.n
+    return np.asarray(np.abs(surface.matrix[:, n:] @ np.linalg.inv(mechanism.M(np.zeros(n)))))
 
 
 @dataclass(frozen=True, eq=False)
