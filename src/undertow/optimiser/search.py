@@ -140,7 +140,11 @@ def _own_search(task: Optimisation) -> Iterator[bool]:
     scores = task.cost(z)
     if task.optimiser.counts_time:
         done = _along_ridge(task, min(POLISH, task.left))
-        if _near_one_plant(task):
+        if not task.best_cost < INADMISSIBLE:
+            if task.loop.ensemble is None:
+                _descend_from_draws(task, ALONE, 3 * ALONE)
+            else:
+                _near_one_plant(task)
             done = _along_ridge(task, min(POLISH, task.left))
         yield done
         again, done = task.optimiser.freedom.schedule > 0, False
@@ -156,7 +160,8 @@ def _own_search(task: Optimisation) -> Iterator[bool]:
         return
     if task.centre.size <= MODEL_SIZE:
         _model_search(task, task.centre)
-        _near_one_plant(task)
+        if not task.best_cost < INADMISSIBLE:
+            _near_one_plant(task)
         yield False
     optimiser, rng, total = task.optimiser, task.rng, task.evaluations + task.left
     draws = max(optimiser.population, total // 6)
@@ -184,28 +189,30 @@ def _own_search(task: Optimisation) -> Iterator[bool]:
         yield _descend(task, task.centre, 0.1, task.left, 1e-4)
 
 
-def _near_one_plant(task: Optimisation) -> bool:
-    """Where nothing suits every plausible plant, look near what is best for one, the estimate.
+def _near_one_plant(task: Optimisation) -> None:
+    """Look near what is best for one plant, the estimate, for what suits every plausible one.
 
     That takes a fraction of the time, and what suits all may be near it: a motion that goes up to
     the singularity (37) on one plant is past it on the next.
     """
-    one = None if task.best_cost < INADMISSIBLE else task.for_one_plant()
+    one = task.for_one_plant()
     if one is None or task.late():
-        return False
+        return
     for _ in _own_search(one):
         pass
     task.take_time_of(one)
-    if one.best is None or not one.best_cost < INADMISSIBLE:
-        return False
-    here = task.space.encode(one.best)
-    if not task.optimiser.counts_time and here.size <= MODEL_SIZE:
-        _model_search(task, here, min(ALONE, task.left))
-    if not task.best_cost < INADMISSIBLE:
-        _look_around(task, here)
-    if not task.best_cost < INADMISSIBLE:
-        _descend(task, task.centre, 0.3, min(ALONE, task.left), 1e-3)
-    return task.best_cost < INADMISSIBLE
+    if one.best is not None and one.best_cost < INADMISSIBLE:
+        for spread in (0.1, 0.3, 0.03):
+            if not task.best_cost < INADMISSIBLE:
+                _descend(task, task.space.encode(one.best), spread, min(ALONE, task.left), 1e-3)
+
+
+def _descend_from_draws(task: Optimisation, draws: int, share: int) -> None:
+    """Descend from the best three of many draws, until a plan is admissible."""
+    z = task.firsts[0] + task.space.steps(task.rng, np.ones(max(1, min(draws, task.left))))
+    for start in z[np.argsort(task.cost(z), kind="stable")[:3]]:
+        if not task.best_cost < INADMISSIBLE:
+            _descend(task, start, 0.3, share, 3e-3)
 
 
 def single_budget(size: int) -> int:
