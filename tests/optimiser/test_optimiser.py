@@ -311,3 +311,33 @@ def test_a_start_beyond_half_a_turn_is_told_what_it_is_but_for_a_turn(rig: ut.Me
         with pytest.raises(InfeasibleError) as caught:
             nothing.required(ut.ClosedLoop(model, ut.MinimumTime()), model.state(phi=ut.deg(angle)))
         assert "but for a turn" not in str(caught.value)
+
+
+@pytest.mark.slow  # a kernel of its own
+def test_what_suits_every_plant_is_found_near_what_is_best_for_one() -> None:
+    """No design brings three links on two motors home from there, whatever their masses are."""
+    a, b, c = coordinates = [ut.Coordinate(name, "rad") for name in "abc"]
+    angles, v = [a.symbol, a.symbol + b.symbol], [q.velocity for q in coordinates]
+    angles.append(angles[1] + c.symbol)
+    symbols, rates = [q.symbol for q in coordinates], [v[0], v[0] + v[1], sum(v)]
+    x = z = kinetic = potential = sp.Integer(0)
+    masses = [ut.Parameter(f"m_{k}", m, "kg", low=0) for k, m in enumerate((0.138, 0.145, 1.998))]
+    for k, (length, inertia) in enumerate(((0.127, 0.0134), (0.292, 0.0055), (0.304, 0.0093))):
+        middle = sp.Matrix([x + length / 2 * sp.sin(angles[k]), z + length / 2 * sp.cos(angles[k])])
+        x, z = x + length * sp.sin(angles[k]), z + length * sp.cos(angles[k])
+        moved = middle.jacobian(symbols) * sp.Matrix(v)
+        kinetic += masses[k].symbol * moved.dot(moved) / 2 + inertia * rates[k] ** 2 / 2
+        potential += masses[k].symbol * 9.81 * middle[1]
+    rig = ut.Mechanism.from_energies(
+        "three_links", coordinates, [ut.Input("u_a", "N m", 35.8), ut.Input("u_b", "N m", 7.25)],
+        kinetic=kinetic, dissipation=sum(0.045 * w**2 for w in v), parameters=tuple(masses),
+        potential=potential + 0.1 * symbols[0] ** 2 + 0.17 * symbols[2] ** 2,
+    )  # fmt: skip
+    start = rig.state(a=-0.192, b=-0.049, c=-0.156, a_dot=-0.042, b_dot=0.276, c_dot=-0.169)
+    cascade = ut.Cascade(rig)
+    assert cascade.loop.ensemble is not None
+    designs = [ut.Plan.of(surface) for surface in cascade.optimiser.designs]
+    assert not cascade.loop.batch(start, designs).reached.any()
+    first = next(cascade.optimiser.improve(start))
+    assert first.plan is not None
+    assert cascade.loop.batch(start, first.plan).reached[0]

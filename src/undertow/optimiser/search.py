@@ -139,7 +139,14 @@ def _own_search(task: Optimisation) -> Iterator[bool]:
     z = task.firsts[: max(1, task.left)]
     scores = task.cost(z)
     if task.optimiser.counts_time:
-        yield _along_ridge(task, min(POLISH, task.left))
+        done = _along_ridge(task, min(POLISH, task.left))
+        if not task.best_cost < INADMISSIBLE:
+            if task.loop.ensemble is None:
+                _descend_from_draws(task, ALONE, 3 * ALONE)
+            else:
+                _near_one_plant(task)
+            done = _along_ridge(task, min(POLISH, task.left))
+        yield done
         again, done = task.optimiser.freedom.schedule > 0, False
         if again:
             for done in follow_earliest(task, task.left // 2):
@@ -153,6 +160,8 @@ def _own_search(task: Optimisation) -> Iterator[bool]:
         return
     if task.centre.size <= MODEL_SIZE:
         _model_search(task, task.centre)
+        if not task.best_cost < INADMISSIBLE:
+            _near_one_plant(task)
         yield False
     optimiser, rng, total = task.optimiser, task.rng, task.evaluations + task.left
     draws = max(optimiser.population, total // 6)
@@ -178,6 +187,32 @@ def _own_search(task: Optimisation) -> Iterator[bool]:
         task.kept = 0
         task.switch_at(_division(task))
         yield _descend(task, task.centre, 0.1, task.left, 1e-4)
+
+
+def _near_one_plant(task: Optimisation) -> None:
+    """Look near what is best for one plant, the estimate, for what suits every plausible one.
+
+    That takes a fraction of the time, and what suits all may be near it: a motion that goes up to
+    the singularity (37) on one plant is past it on the next.
+    """
+    one = task.for_one_plant()
+    if one is None or task.late():
+        return
+    for _ in _own_search(one):
+        pass
+    task.take_time_of(one)
+    if one.best is not None and one.best_cost < INADMISSIBLE:
+        for spread in (0.1, 0.3, 0.03):
+            if not task.best_cost < INADMISSIBLE:
+                _descend(task, task.space.encode(one.best), spread, min(ALONE, task.left), 1e-3)
+
+
+def _descend_from_draws(task: Optimisation, draws: int, share: int) -> None:
+    """Descend from the best three of many draws, until a plan is admissible."""
+    z = task.firsts[0] + task.space.steps(task.rng, np.ones(max(1, min(draws, task.left))))
+    for start in z[np.argsort(task.cost(z), kind="stable")[:3]]:
+        if not task.best_cost < INADMISSIBLE:
+            _descend(task, start, 0.3, share, 3e-3)
 
 
 def single_budget(size: int) -> int:

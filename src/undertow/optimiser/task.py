@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -138,6 +139,25 @@ class Optimisation:
             optimiser, self.x, self.horizon, Budget(most, left),
             resolution=self.resolution, sequence=self.sequence, warm=False,
         )  # fmt: skip
+
+    def for_one_plant(self) -> Optimisation | None:
+        """The task for the estimate alone, and a single surface; ``None`` without an ensemble."""
+        if self.loop.ensemble is None:
+            return None
+        optimiser = self.optimiser.on(replace(self.loop, ensemble=None))
+        if optimiser.space.segments > 1 or optimiser.freedom.schedule:
+            assert optimiser.plainer is not None  # a single surface
+            optimiser = optimiser.plainer
+        left = max(self.budget.seconds - (time.perf_counter() - self.began), ANSWERING)
+        return Optimisation(
+            optimiser, self.x, self.horizon, Budget(self.budget.evaluations, left),
+            resolution=self.resolution, sequence=self.sequence, warm=False,
+        )  # fmt: skip
+
+    def take_time_of(self, one: Optimisation) -> None:
+        """Count the evaluations of a task for one plant as what they are of this one's."""
+        assert self.loop.ensemble is not None  # else there is no such task
+        self.evaluations += one.evaluations // len(self.loop.ensemble.values)
 
     def switch_at(self, times: tuple[float, ...]) -> None:
         """Search from now on for surfaces that take over at these times, s."""
