@@ -48,7 +48,7 @@ from undertow.law import (
     coupling,
     gains_at_target,
 )
-from undertow.models import FloatArray, Mechanism, fastest_rate, has_linear_model
+from undertow.models import FloatArray, Mechanism, has_linear_model, steps_in
 from undertow.objective import MinimumEnergy, Objective
 
 #: Relative tolerance of motions that are shown, and that decide.
@@ -60,7 +60,7 @@ TOLERANCES = 1e-13, 1e-2
 
 #: Longest Runge-Kutta step of a batch in time constants of the plant's fastest mode: beyond 2.7 of
 #: them what has long died out would grow.
-OF_FASTEST = 1.5
+STABLE = 1.5
 
 #: The smallest margin at the target that the price of being outside of a constraint is made from.
 LEAST_ROOM = 1e-9
@@ -299,7 +299,7 @@ class ClosedLoop:
     @cached_property
     def substeps(self) -> int:
         """Runge-Kutta steps of a batch in one step of the loop: several where a mode is fast."""
-        return max(1, math.ceil(fastest_rate(self.truth) * self.step / OF_FASTEST))
+        return steps_in(self.truth, self.step, self.step, STABLE)
 
     @checked
     def believing(self, mechanism: Mechanism, ensemble: Ensemble | None = None) -> ClosedLoop:

@@ -180,15 +180,18 @@ def fastest_rate(mechanism: Mechanism) -> float:
         return 0.0
 
 
-def longest_step(mechanism: Mechanism, most: float) -> float:
-    """Return how long Runge-Kutta steps may be, s: ``most``, or less where a mode is fast."""
+def longest_step(mechanism: Mechanism, most: float, part: float = OF_FASTEST) -> float:
+    """Return how long Runge-Kutta steps may be, s: ``most``, or less where a mode is fast.
+
+    That is, longer than ``part`` of its time constant.
+    """
     rate = fastest_rate(mechanism)
-    return OF_FASTEST / rate if rate * most > OF_FASTEST else most
+    return part / rate if rate * most > part else most
 
 
-def steps_in(mechanism: Mechanism, seconds: float, most: float) -> int:
+def steps_in(mechanism: Mechanism, seconds: float, most: float, part: float = OF_FASTEST) -> int:
     """Return how many Runge-Kutta steps a length takes, none longer than :func:`longest_step`."""
-    return math.ceil(seconds / longest_step(mechanism, most) - 1e-9)
+    return math.ceil(seconds / longest_step(mechanism, most, part) - 1e-9)
 
 
 def linear_accelerations(mechanism: Mechanism, values: FloatArray) -> tuple[FloatArray, FloatArray]:

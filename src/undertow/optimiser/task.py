@@ -134,11 +134,7 @@ class Optimisation:
         own = self.optimiser.usual_cold.evaluations - optimiser.usual_cold.evaluations
         most = max(budget.evaluations - own, budget.evaluations // 4, 1)
         self.budget = Budget(max(budget.evaluations - most, 1), budget.seconds)
-        left = max(budget.seconds - (time.perf_counter() - self.began), ANSWERING)
-        return Optimisation(
-            optimiser, self.x, self.horizon, Budget(most, left),
-            resolution=self.resolution, sequence=self.sequence, warm=False,
-        )  # fmt: skip
+        return self._from_cold(optimiser, most)
 
     def for_one_plant(self) -> Optimisation | None:
         """The task for the estimate alone, and a single surface; ``None`` without an ensemble."""
@@ -148,9 +144,13 @@ class Optimisation:
         if optimiser.space.segments > 1 or optimiser.freedom.schedule:
             assert optimiser.plainer is not None  # a single surface
             optimiser = optimiser.plainer
+        return self._from_cold(optimiser, self.budget.evaluations)
+
+    def _from_cold(self, optimiser: Optimiser, evaluations: int) -> Optimisation:
+        """The task of another optimiser, from nothing, in the time that is left."""
         left = max(self.budget.seconds - (time.perf_counter() - self.began), ANSWERING)
         return Optimisation(
-            optimiser, self.x, self.horizon, Budget(self.budget.evaluations, left),
+            optimiser, self.x, self.horizon, Budget(evaluations, left),
             resolution=self.resolution, sequence=self.sequence, warm=False,
         )  # fmt: skip
 
