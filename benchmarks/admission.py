@@ -25,7 +25,7 @@ import numpy as np
 
 import undertow as ut
 from undertow.cascade import cost_gate
-from undertow.cascade.cascade import TAIL_RTOL
+from undertow.cascade.planners import TAIL_RTOL
 from undertow.proofs.gate import GatePolicy, assess, certified_gate
 from undertow.proofs.search.terminal_ellipsoid import search_for
 

@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 import undertow as ut
-from undertow.cascade.cascade import TAIL_RTOL
+from undertow.cascade.planners import TAIL_RTOL
 from undertow.models import FloatArray
 
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.025)

@@ -23,7 +23,7 @@ from dataclasses import replace
 import numpy as np
 
 import undertow as ut
-from undertow.cascade.cascade import TAIL_RTOL
+from undertow.cascade.planners import TAIL_RTOL
 from undertow.models import FloatArray
 
 FAMILY: dict[int, Callable[[], ut.Mechanism]] = {

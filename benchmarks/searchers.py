@@ -34,7 +34,7 @@ import numpy as np
 import scipy.optimize
 
 import undertow as ut
-from undertow.cascade.cascade import TAIL_RTOL
+from undertow.cascade.planners import TAIL_RTOL
 from undertow.closed_loop import LANES
 from undertow.models import FloatArray
 from undertow.optimiser import CMAES

@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 import undertow as ut
-from undertow.cascade.cascade import TAIL_RTOL
+from undertow.cascade.planners import TAIL_RTOL
 from undertow.closed_loop.trajectory import Batch
 from undertow.law import sliding_matrix
 from undertow.models import FloatArray

@@ -10,7 +10,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 import undertow as ut
-from undertow.cascade.cascade import TAIL_RTOL
+from undertow.cascade.planners import TAIL_RTOL
 from undertow.closed_loop import ClosedLoop, Event
 from undertow.closed_loop.linear_blocks import STEP_SIZES, UNIT
 from undertow.closed_loop.linear_model import Prepared

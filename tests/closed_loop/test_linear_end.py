@@ -15,7 +15,7 @@ import sympy as sp
 
 import undertow as ut
 from support import SHAPES, random_mechanism, random_surface, rest_slow
-from undertow.cascade.cascade import TAIL_RTOL
+from undertow.cascade.planners import TAIL_RTOL
 from undertow.closed_loop import ClosedLoop, Ensemble, Event, RolloutBuffers
 from undertow.closed_loop.linear_model import NOBODY, Prepared, TerminalLinearModel, _solve
 from undertow.closed_loop.work_array import LANES

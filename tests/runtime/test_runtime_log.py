@@ -133,7 +133,7 @@ def test_same_seed_same_log(logged: Path, tmp_path: Path) -> None:
 HASHED = """
 import hashlib
 import undertow as ut
-from undertow.cascade.cascade import CascadeState
+from undertow.cascade import CascadeState
 from undertow.law.schedule import Plan
 from undertow.runtime import Command, Inputs, Recipe
 recipe = Recipe(rig="realistic", start=(0.0, 0.2, 0.0, 0.0))

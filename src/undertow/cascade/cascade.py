@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
-from functools import cached_property, lru_cache, partial
-from typing import Any, Literal, NamedTuple, cast
+from functools import cached_property
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,11 +21,14 @@ from undertow.base import (
     at_least,
     check_fields,
     checked,
-    error_text,
     one_of,
     positive,
 )
-from undertow.cascade.robustness import sticking_distance
+from undertow.cascade.judge import Judge
+from undertow.cascade.planners import Planners, searched
+from undertow.cascade.planning import first_plan, next_plan
+from undertow.cascade.predictions import Predictions
+from undertow.cascade.reserve import Reserve
 from undertow.cascade.simulation import (
     Run,
     Update,
@@ -35,9 +38,10 @@ from undertow.cascade.simulation import (
     moving_loops,
     simulate_piece,
 )
-from undertow.cascade.targets import LoopsAbout, legs_of
-from undertow.closed_loop import INADMISSIBLE, RTOL, ClosedLoop, Event, Trajectory, simulate_along
-from undertow.closed_loop.gate import Admission, Gate, broken_by, cost_gate
+from undertow.cascade.state import CascadeState
+from undertow.cascade.targets import legs_of
+from undertow.closed_loop import RTOL, ClosedLoop, Event, Trajectory
+from undertow.closed_loop.gate import Admission, Gate, cost_gate
 from undertow.estimators import Belief, Estimator, ParameterEstimate
 from undertow.law import (
     Control,
@@ -55,78 +59,6 @@ from undertow.optimiser import Budget, DecisionVariables, Optimiser, Planner, Pr
 
 #: Stands for the objective that is meant where nobody says, until the mechanism is known.
 _USUAL = cast(Objective, None)
-
-#: Relative tolerance of the linear tail in the optimiser's rollouts.
-TAIL_RTOL = 2e-3
-
-#: Largest step times rate of the boundary layer in the optimiser's rollouts.
-RESOLVED = 1.0
-
-#: How much more a first plan may cost than the search found, as a factor, before it is searched for
-#: again in smaller steps; and how much smaller they are.
-AGREES, FINER = 1.01, 4
-
-#: How many times the reaching gains and layers of the plans in reserve are the cascade's: near the
-#: target all are the same feedback, far from it each asks for more input before it saturates.
-STRONGER = (1.0, 2.0, 4.0, 8.0)
-
-#: How far positions may be off what the plan in use predicted for them before an admission says
-#: so: this much, rad or m, and this part of how far the plan was to move them meanwhile.  A target
-#: that jumps shows in positions at once; what a model does not know shows in velocities first.
-JUMP, PART = 0.1, 0.5
-
-
-@dataclass(frozen=True)
-class CascadeState:
-    """What the cascade remembers between steps.
-
-    ``plan`` is in use since the time ``since``; ``sequence`` is the number of the last
-    proposal considered; ``predicted`` is the predicted cost J̃_k at the last decision;
-    ``scale`` that of the first; ``x`` the state at ``since``, empty where it is not known;
-    ``estimate`` what is known of the plant's parameters, where the cascade learns them;
-    ``target`` where the target is, where it is not at x = 0: ``x`` is counted from it;
-    ``disturbance`` how large a matched disturbance is, in the inputs' units, (m,), where it is
-    estimated.
-    """
-
-    plan: Plan
-    sequence: int = 0
-    predicted: float = math.inf
-    scale: float = 0.0
-    since: float = 0.0
-    x: tuple[float, ...] = ()
-    estimate: ParameterEstimate | None = None
-    target: ReferenceMotion | None = None
-    disturbance: tuple[float, ...] = ()
-
-    @property
-    def surface(self) -> Surface:
-        """The first surface of the plan in use."""
-        return self.plan.surfaces[0]
-
-    def at(self, t: float) -> Plan:
-        """Return what is left of the plan in use at time t, s."""
-        return self.plan.shifted(t - self.since)
-
-    def error(self, t: float, x: FloatArray) -> FloatArray:
-        """Return how far a state x, (…, 2n), is off the target at time t, s."""
-        return x if self.target is None else x - self.target.state(t)
-
-    def absolute(self, t: float, error: FloatArray) -> FloatArray:
-        """Return the state that is so far off the target at time t, s: the inverse."""
-        return error if self.target is None else error + self.target.state(t)
-
-
-class FirstTry(NamedTuple):
-    """An answer to the search for a first plan, and the cost of its plan where it was judged.
-
-    ``rank`` is 0 where it is good, 1 if it is for every plausible plant, 2 if it is for the
-    estimate, 3 where there is none.
-    """
-
-    rank: int
-    cost: float
-    proposal: Proposal
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,45 +249,8 @@ class Cascade:
             returning=True,
         )
 
-    @checked
-    def loop_at(self, state: CascadeState, t: float | None = None) -> ClosedLoop:
-        """The predicted closed loop with what is known by now of the plant, about the target.
-
-        Where the target is a reference on its way, it is taken to stay where it is at time t, s, by
-        default ``state.since``.
-        """
-        when = state.since if t is None else t
-        return self.about(self._loops(state.estimate), state.target, when)
-
-    @checked
-    def believed(self, state: CascadeState) -> Mechanism:
-        """The mechanism with the parameters that are estimated by now: the law's."""
-        return self._loops(state.estimate).mechanism
-
     @cached_property
-    def _loops_about(self) -> LoopsAbout:
-        return LoopsAbout(self.mechanism, self.objective)
-
-    @checked
-    def about(self, loop: ClosedLoop, target: ReferenceMotion | None, t: float) -> ClosedLoop:
-        """A loop of this cascade about a target, as it is at the time t."""
-        return loop if target is None else self._loops_about.loop(loop, target.position(t))
-
-    @cached_property
-    def _loops(self) -> Callable[[ParameterEstimate | None], ClosedLoop]:
-        """The predicted closed loop for an estimate; the latest are kept."""
-        belief, prior = self.known, self.loop
-
-        @lru_cache(maxsize=2)
-        def loop(estimate: ParameterEstimate | None) -> ClosedLoop:
-            if belief is None or estimate is None or estimate is belief.prior:
-                return prior
-            return prior.believing(belief.believed(estimate), belief.ensemble(estimate))
-
-        return loop
-
-    @cached_property
-    def _recourse(self) -> bool:
+    def recourse(self) -> bool:
         """Whether plans are for the estimate alone, and later decisions mend them for the plant.
 
         What arrives without sliding in does so on one plant only: no mean over an ensemble says
@@ -368,16 +263,61 @@ class Cascade:
             and self.loop.counts_time
         )
 
+    # -- what it is made of -----------------------------------------------------------------
+
     @cached_property
-    def _estimated(self) -> Callable[[ParameterEstimate | None], ClosedLoop]:
-        """The predicted closed loop of an estimate taken for the plant; the latest are kept."""
-        alone = replace(self.loop, ensemble=None)
+    def predictions(self) -> Predictions:
+        """The loops that it predicts with."""
+        return Predictions(self.loop, self.known, self.objective)
 
-        @lru_cache(maxsize=2)
-        def loop(estimate: ParameterEstimate | None) -> ClosedLoop:
-            return alone.believing(self._loops(estimate).mechanism)
+    @cached_property
+    def optimiser(self) -> Optimiser:
+        """The optimiser of the outer loop; its rollouts end in the exact linear tail."""
+        single = self.recourse and self.freedom.schedule > 0
+        loop = self.predictions.estimated(None) if single else self.loop
+        return Optimiser(
+            searched(loop, self.freedom),
+            self.first, self.cold, self.warm, self.freedom, seed=self.seed,
+        )  # fmt: skip
 
-        return loop
+    @cached_property
+    def _planners(self) -> Planners:
+        return Planners(self.predictions, self.optimiser, self.planner, self.recourse)
+
+    @cached_property
+    def _reserve(self) -> Reserve:
+        return Reserve(self.optimiser.anchor, self.reaching, self.period)
+
+    @property
+    def reserve(self) -> tuple[Plan, ...]:
+        """Plans that are there without a search: the first surface, reached ever more strongly."""
+        return self._reserve.plans
+
+    @cached_property
+    def _judge(self) -> Judge:
+        return Judge(self.predictions, self._reserve, self.gate, self.objective, self.recourse)
+
+    # -- what it knows ----------------------------------------------------------------------
+
+    @checked
+    def loop_at(self, state: CascadeState, t: float | None = None) -> ClosedLoop:
+        """The predicted closed loop with what is known by now of the plant, about the target.
+
+        Where the target is a reference on its way, it is taken to stay where it is at time t, s, by
+        default ``state.since``.
+        """
+        when = state.since if t is None else t
+        return self.predictions.at(state, when)
+
+    @checked
+    def believed(self, state: CascadeState) -> Mechanism:
+        """The mechanism with the parameters that are estimated by now: the law's."""
+        return self.predictions.plausible(state.estimate).mechanism
+
+    @checked
+    def about(self, loop: ClosedLoop, target: ReferenceMotion | None, t: float) -> ClosedLoop:
+        """A loop of this cascade about a target, as it is at the time t."""
+        return self.predictions.about(loop, target, t)
 
     @checked
     def learns_from(self, estimator: Estimator) -> bool:
@@ -400,62 +340,6 @@ class Cascade:
             return state
         return replace(state, estimate=self.known.learn(state.estimate, t, x, u))
 
-    @cached_property
-    def optimiser(self) -> Optimiser:
-        """The optimiser of the outer loop; its rollouts end in the exact linear tail.
-
-        Its steps are twice as long where that resolves the boundary layer: the gate integrates
-        what it finds again.  A time of arrival is a matter of milliseconds, and is not searched
-        for with longer steps than it is judged with.
-        """
-        single = self._recourse and self.freedom.schedule > 0
-        loop = self._estimated(None) if single else self.loop
-        return Optimiser(
-            self._for_search(loop),
-            self.first, self.cold, self.warm, self.freedom, seed=self.seed,
-        )  # fmt: skip
-
-    @cached_property
-    def _robust(self) -> Optimiser:
-        """The optimiser of plans that suit every plausible plant."""
-        if self.optimiser.loop.ensemble is not None or not self._recourse:
-            return self.optimiser
-        freedom = replace(self.freedom, schedule=0.0)
-        return replace(self.optimiser, loop=self._for_search(self.loop), freedom=freedom)
-
-    def _for_search(self, loop: ClosedLoop) -> ClosedLoop:
-        """Return a predicted closed loop as the optimiser integrates it."""
-        end = loop.linear_end
-        smooth = end is not None and end.counts_cost and not self.freedom.reaching
-        eta, layer = self.reaching.per_surface(self.mechanism.m)
-        slow = 2 * self.step * float((eta / layer).max()) <= RESOLVED
-        even = all(round(t / self.step) % 2 == 0 for t in self.freedom.times)
-        larger = smooth and slow and even and not any(self.mechanism.disturbance_bounds)
-        return loop.with_steps(self.step * (2 if larger else 1), TAIL_RTOL)
-
-    def _planner(
-        self, exact: ClosedLoop, target: ReferenceMotion | None = None, t: float = 0.0
-    ) -> Planner:
-        """Who is asked for plans: ``planner``, or else the optimiser of a predicted closed loop."""
-        if self.planner is not None:
-            return self.planner
-        return self._optimiser_of(exact, target, t)
-
-    def _suited(self, loop: ClosedLoop) -> Optimiser:
-        """The optimiser for one plant, or for an ensemble of plausible ones."""
-        return self.optimiser if loop.ensemble is None else self._robust
-
-    def _optimiser_of(
-        self, exact: ClosedLoop, target: ReferenceMotion | None, t: float
-    ) -> Optimiser:
-        """The optimiser of a predicted closed loop, about a target."""
-        optimiser = self._suited(exact)
-        if exact is not self.loop:
-            optimiser = optimiser.on(self._for_search(exact))
-        if target is None:
-            return optimiser
-        return self._loops_about.optimiser(optimiser, target.position(t))
-
     def __repr__(self) -> str:
         """Show what is controlled, for what, and how often it is planned anew."""
         return f"Cascade({self.mechanism.name}, {self.objective.name}, period={self.period:g} s)"
@@ -464,117 +348,6 @@ class Cascade:
         """What it was made from: a copy compiles, or finds, the same kernels."""
         made = {field.name: getattr(self, field.name) for field in fields(self)}
         return made | {"objective": self.objective.written(self.mechanism)}
-
-    @cached_property
-    def reserve(self) -> tuple[Plan, ...]:
-        """Plans that are there without a search: the first surface, reached ever more strongly.
-
-        It bears what it was designed for, and a large s brings its law to the limits of the input
-        at once, where the cascade's own reaching law is content with η.
-        """
-        eta, layer = self.reaching.per_surface(self.mechanism.m)
-        laws = [
-            replace(self.reaching, eta=tuple(c * eta), layer=tuple(c * layer)) for c in STRONGER
-        ]
-        return tuple(Plan((self.optimiser.anchor,), (0.0,), (law,)) for law in laws)
-
-    def _standing(
-        self, state: CascadeState, loop: ClosedLoop, plan: Plan, error: FloatArray, span: float
-    ) -> Plan:
-        """The plan in use, or where it does not suit every plausible plant the best in reserve.
-
-        A plan with which a joint sticks suits none.  One that is to be mended need not suit all.
-        """
-        if loop.ensemble is None:
-            return plan
-        sticks = self._sticks(state, loop, plan) > 0
-        if not sticks and self._mendable(state, loop, plan, error, span):
-            return plan
-        better = self._better_in_reserve(loop, plan, error.tobytes(), span, sticks)
-        return plan if better is None else better
-
-    @cached_property
-    def _better_in_reserve(
-        self,
-    ) -> Callable[[ClosedLoop, Plan, bytes, float, bool], Plan | None]:
-        """The plan in reserve that is better than one in use, which may stick; ``None``: none is.
-
-        A decision asks twice, for the search and for the gate: the latest answers are kept.
-        """
-
-        @lru_cache(maxsize=2)
-        def better(
-            loop: ClosedLoop, plan: Plan, error: bytes, span: float, sticks: bool
-        ) -> Plan | None:
-            x = np.frombuffer(error).reshape(-1, 2 * self.mechanism.n)
-            if not sticks and loop.batch(x, plan, duration=span).score(span)[0] < INADMISSIBLE:
-                return None
-            scores = loop.batch(x, [plan, *self.reserve], duration=span).score(span)
-            ranks = [(score >= INADMISSIBLE, False, score) for score in scores]
-            ranks[0] = (scores[0] >= INADMISSIBLE, sticks, scores[0])
-            best = min(range(len(ranks)), key=ranks.__getitem__)
-            return self.reserve[best - 1] if best else None
-
-        return better
-
-    def _mendable(
-        self, state: CascadeState, loop: ClosedLoop, plan: Plan, error: FloatArray, span: float
-    ) -> bool:
-        """Whether a plan brings the estimate home, and may be mended for the plant later on."""
-        if not self._recourse:
-            return False
-        estimated = self._estimated_at(state)
-        arrives = estimated.batch(error, plan, duration=span, precise=True).reached[0]
-        return bool(arrives) and self._recoverable(loop, error, plan)
-
-    def _recoverable(self, loop: ClosedLoop, error: FloatArray, plan: Plan) -> bool:
-        """Whether one in reserve would bring every plausible plant home after the next period."""
-        k = sum(t < self.period - 1e-9 for t in plan.times)
-        plans = [
-            Plan(
-                plan.surfaces[:k] + last.surfaces,
-                (*plan.times[:k], self.period),
-                plan.laws(self.reaching)[:k] + last.laws(self.reaching),
-            )
-            for last in self.reserve
-        ]
-        return bool(loop.batch(error, plans).reached.any())
-
-    def _estimated_at(self, state: CascadeState) -> ClosedLoop:
-        """The predicted closed loop of the estimate taken for the plant, about the target."""
-        return self.about(self._estimated(state.estimate), state.target, state.since)
-
-    @cached_property
-    def _bounds_input(self) -> bool:
-        """Whether a plan may break a bound on the input between two steps of a prediction."""
-        return self.known is not None and (
-            self.objective.hard_input or self.loop.objective != self.objective
-        )
-
-    def _breaks(
-        self, state: CascadeState, plans: list[Plan], error: FloatArray, span: float
-    ) -> list[tuple[float, str]]:
-        """When each plan breaks a constraint on the estimate, s, and which; infinite: none does.
-
-        An input that changes with the plan may pass its bound and be back within a step: what suits
-        every plausible plant at the steps of an ensemble is integrated to the tolerance on one.
-        """
-        if not self._bounds_input:
-            return [(math.inf, "")] * len(plans)
-        loop = self._estimated_at(state)
-        motions = loop.batch(error, plans, duration=span, precise=True)
-        names = [broken_by(loop, motions, k) for k in range(len(plans))]
-        ends = zip(motions.time.tolist(), names, strict=True)
-        return [(t if name else math.inf, name) for t, name in ends]
-
-    def _sticks(self, state: CascadeState, loop: ClosedLoop, plan: Plan) -> float:
-        """How far off a joint sticks on the last surface of a plan; 0 within the terminal set."""
-        if not state.disturbance or loop.ensemble is None:
-            return 0.0
-        law = plan.laws(self.reaching)[-1]
-        size = np.array(state.disturbance)
-        off = sticking_distance(loop.mechanism, plan.surfaces[-1], size, law)
-        return off if off > self.objective.terminal_radius else 0.0
 
     # -- the state machine ----------------------------------------------------------------
 
@@ -662,109 +435,7 @@ class Cascade:
         The first plan is to arrive within ``longest``, s, where one does, else within the
         objective's horizon.
         """
-        absolute, horizon = x, min(longest, self.objective.horizon)
-        short = horizon < self.objective.horizon
-        if target is not None:
-            x = self.mechanism.check_state(x) - target.state(t)
-        number, known = 0, None if self.known is None else self.known.prior
-        if before is not None:
-            number, known = before.sequence + 1, before.estimate or known
-        whole = self._loops(known)
-        here = self.about(whole, target, t)
-        here.objective.check_start(here.mechanism, x)
-        # Where nothing suits every plausible plant, what brings home the estimate, without room for
-        # any error: to learn which of the plants it is takes less time than to fall.
-        single = None
-        if self.known is not None and known is not None:
-            single = whole.believing(whole.mechanism, self.known.single(known))
-        last = [] if single is None else [(single, None)]
-        tries: list[FirstTry] = []
-        for loop, fixed in [*self._first_tries(known), *last]:
-            if loop is single and tries[-1].proposal.plan is not None:
-                break
-            about, planner = self.about(loop, target, t), self._planner(loop, target, t)
-            if fixed is not None:
-                planner = self._suited(fixed).on(self.about(fixed, target, t))
-            proposal = planner.propose(
-                x, incumbent=None, horizon=horizon if short else None, sequence=0, computed_for=t,
-                resolution=0.0,
-            )  # fmt: skip
-            plan = proposal.plan
-            if plan is None:
-                tries.append(FirstTry(3, math.inf, proposal))
-                continue
-            cost = float(about.batch(x, plan, duration=horizon, precise=True).score(horizon)[0])
-            cost = cost if cost < INADMISSIBLE else math.inf
-            begun = CascadeState(plan, number, cost, cost, t, _kept(x), known, target)
-            good = math.isfinite(cost) and math.isinf(self._breaks(begun, [plan], x, horizon)[0][0])
-            if loop is not whole:  # every plausible plant lives to see the next decision
-                lives = self._survives if loop.ensemble is not None else self._recoverable
-                good &= lives(here, x, plan)
-            if loop.ensemble is None and self.planner is None:
-                good &= cost <= AGREES * proposal.cost
-            tries.append(FirstTry(0 if good else 1 if loop is whole else 2, cost, proposal))
-            if good:
-                break
-        best = min(tries, key=lambda one: (one.rank, one.cost))
-        if best.proposal.plan is None and short:
-            return self.start_to(absolute, target, t, before)
-        cost, proposal = best.cost, best.proposal
-        plan = proposal.required(here, x).plan
-        assert plan is not None  # required
-        if target is not None and target.moves:
-            plan, cost = self._first_along(whole, plan, x, target, t, horizon)
-        begun = CascadeState(plan, number, cost, cost, t, _kept(x), known, target)
-        return begun, replace(proposal, sequence=number)
-
-    def _first_along(
-        self, loop: ClosedLoop, plan: Plan, error: FloatArray, target: ReferenceMotion, t: float,
-        horizon: float,
-    ) -> tuple[Plan, float]:  # fmt: skip
-        """The first plan, or the designed surface where that is better along a reference."""
-        plans = [plan, Plan.of(self.optimiser.anchor)]
-        costs = _costs_along(loop, error, plans, target, t, horizon)
-        best = int(np.argmin(costs))
-        return plans[best], costs[best]
-
-    def _first_tries(
-        self, estimate: ParameterEstimate | None
-    ) -> list[tuple[ClosedLoop, ClosedLoop | None]]:
-        """What the first plan is to be best on, one after the other; and in what steps, if fixed.
-
-        Before anything has moved, what suits every plausible plant suits none of them well: the
-        estimate alone comes first, for a plan that the next decision replaces; a schedule for it
-        without any error before.  Where its plan does not do what it promised, small steps
-        throughout follow: for one plant, which is integrated to the tolerance, smaller ones than
-        usual.
-        """
-        whole = self._loops(estimate)
-        if self.planner is not None:
-            return [(whole, None)]
-        loops = [whole]
-        if self.known is not None and estimate is not None:
-            loops.insert(0, whole.believing(whole.mechanism, self.known.alone(estimate)))
-        if self._recourse and self.freedom.schedule:
-            loops.insert(0, self._estimated(estimate))
-
-        def smaller(loop: ClosedLoop) -> ClosedLoop:
-            adapts = loop.ensemble is None and not self.zoh_steps
-            return loop.with_steps(self.step / FINER, 0.0) if adapts else loop
-
-        return [(loop, fixed) for loop in loops for fixed in (None, smaller(loop))]
-
-    def _judged(
-        self, loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, span: float
-    ) -> Admission:
-        """What the gate says of a plan, in the place of an old one."""
-        said = self.gate(loop, old, new, x, span)
-        if not isinstance(said, Admission):
-            raise InvalidInputError(
-                "what the gate of the cascade returned",
-                value=f"{said!r}, a {type(said).__name__}",
-                limit="an undertow.cascade.Admission",
-                remedy="Return one: of undertow.cascade.cost_gate, with conditions of your own",
-            )
-        return said
+        return first_plan(self._planners, self._judge, x, target, t, before, longest)
 
     @checked
     def first_admission(self, state: CascadeState, x: ArrayLike, horizon: float) -> Admission:
@@ -772,13 +443,8 @@ class Cascade:
 
         The admission says what the gate would have said; ``accepted`` is always true.
         """
-        current = state.error(state.since, self.mechanism.check_state(x))
-        loop, plan = self.loop_at(state), state.plan
-        if self._mendable(state, loop, plan, current, horizon):
-            loop = self._estimated_at(state)
-        asked = self._judged(loop, plan, plan, current, horizon)
-        reason = "first optimum" if asked.accepted else f"first optimum, although {asked.reason}"
-        return Admission(True, reason, state.predicted, asked.verdict)
+        error = state.error(state.since, self.mechanism.check_state(x))
+        return self._judge.first(state, error, horizon)
 
     @checked
     def control(self, state: CascadeState, t: float, x: ArrayLike) -> Control:
@@ -810,15 +476,7 @@ class Cascade:
         t, until
             From when to when, s.  NaN where a motion along a reference breaks off before.
         """
-        plan, target = state.at(t), state.target
-        if target is None or not target.moves:
-            batch = self.loop_at(state, t).batch(error, plan, duration=until - t, terminal=0.0)
-            return np.asarray(batch.x[0])
-        loop, x = self.loop_at(replace(state, target=None)), state.absolute(t, error)
-        motion = simulate_along(loop, x, plan, target, duration=until - t, start=t)
-        if motion.event not in (Event.HORIZON, Event.REACHED):
-            return np.full_like(error, math.nan)
-        return state.error(until, motion.x[-1])
+        return self.predictions.error_at(state, error, t, until)
 
     @checked
     def propose(
@@ -846,39 +504,7 @@ class Cascade:
         it.  Of a target that moves, the search leaves the motion out: it sees the error, and the
         target at rest where it is at the time t.  :meth:`apply_gate` sees the motion.
         """
-        return self._propose(state, x, t, horizon)
-
-    def _propose(
-        self, state: CascadeState, x: ArrayLike, t: float, horizon: float | None
-    ) -> Proposal:
-        sequence = state.sequence + 1
-        try:
-            error = state.error(t, self.mechanism.check_state(x))
-            span = self.objective.horizon if horizon is None else horizon
-            here, loop, used = replace(state, since=t), self.loop_at(state, t), state.at(t)
-            ask: dict[str, Any] = {
-                "horizon": horizon,
-                "sequence": sequence,
-                "computed_for": t,
-                "resolution": self.resolution * state.scale,
-            }
-            if self._recourse:
-                optimiser = self._optimiser_of(self._estimated(state.estimate), state.target, t)
-                admits = partial(self._recoverable, loop, error)
-                first = state.predicted == state.scale  # nothing was decided since
-                promised = 0.0 if first else state.predicted - (t - state.since)
-                found = optimiser.propose(
-                    error, incumbent=used, admits=admits, promised=promised, **ask
-                )
-                plans = [used] if found.plan is None else [found.plan, used]
-                if any(self._mendable(here, loop, plan, error, span) for plan in plans):
-                    return found
-            planner = self._planner(self._loops(state.estimate), state.target, t)
-            standing = self._standing(here, loop, used, error, span)
-            return planner.propose(error, incumbent=standing, **ask)
-        except Exception as error:  # the inner loop must survive whatever the outer loop does
-            said = error_text(error)
-            return Proposal(None, "failed", math.inf, math.inf, (), 0, 0.0, sequence, t, said)
+        return next_plan(self._planners, self._judge, self.resolution, state, x, t, horizon)
 
     @checked
     def apply_gate(
@@ -912,73 +538,8 @@ class Cascade:
         if proposal.sequence <= state.sequence:
             stale = f"stale: number {proposal.sequence} after {state.sequence}"
             return state, Admission(False, stale, state.predicted)
-        t = proposal.computed_for
-        current = state.error(t, current)
-        jump = self._jump(state, t, current)
-        loop = self.loop_at(state, t)
-        used = state.at(t)
-        old = self._standing(replace(state, since=t), loop, used, current, span)
-        state = replace(state, plan=old, since=t, sequence=proposal.sequence, x=_kept(current))
-        mends, mended = (
-            plan is not None and self._mendable(state, loop, plan, current, span)
-            for plan in (old, proposal.plan)
-        )
-        judge = self._estimated_at(state) if mends or mended else loop
-        if proposal.plan is None or (mends and not mended):
-            kept = self._judged(judge, old, old, current, span)
-            reason = f"{proposal.status}: {proposal.message or 'no surface'}{jump}"
-            if proposal.plan is not None:
-                reason = f"some plausible plant would not come home after another period{jump}"
-            admission = replace(kept, accepted=False, reason=reason)
-            return replace(state, predicted=kept.cost), _reserved(admission, old, used)
-        admission = self._judged(judge, old, proposal.plan, current, span)
-        off = self._sticks(state, loop, proposal.plan) if admission.accepted else 0.0
-        if off > self._sticks(state, loop, old):
-            cost = self._judged(loop, old, old, current, span).cost
-            most = f"{self.objective.terminal_radius:g} at most"
-            words = f"a joint that sticks is freed by {off:.3g} of the others, {most}"
-            admission = Admission(False, words, cost)
-        if admission.accepted:
-            (before, _), (end, name) = self._breaks(state, [old, proposal.plan], current, span)
-            if end < before:
-                cost = self._judged(loop, old, old, current, span).cost
-                words = f"breaks {name} between two steps, at {end:.3g} s"
-                admission = Admission(False, words, cost)
-        if state.target is not None and state.target.moves:
-            admission = self._along(state, old, proposal.plan, admission, span)
-        admission = replace(admission, reason=f"{admission.reason}{jump}")
-        plan = proposal.plan if admission.accepted else old
-        admission = _reserved(admission, plan, used)
-        return replace(state, plan=plan, predicted=admission.cost), admission
-
-    def _along(
-        self, state: CascadeState, old: Plan, new: Plan, admission: Admission, span: float
-    ) -> Admission:
-        """Judge again what the gate admitted: both plans along the reference, as it will move."""
-        assert state.target is not None  # there is no reference without one
-        loop, error = self._loops(state.estimate), np.array(state.x)
-        plans = [old, new] if admission.accepted else [old]
-        costs = _costs_along(loop, error, plans, state.target, state.since, span)
-        if not admission.accepted:
-            return replace(admission, cost=costs[0])
-        cost, found = costs
-        if found <= cost and found < math.inf:
-            return replace(admission, cost=found)
-        words = f"raises the cost along the reference: {found:.6g} > {cost:.6g}"
-        return Admission(False, words, cost, admission.verdict)
-
-    def _jump(self, state: CascadeState, t: float, x: FloatArray) -> str:
-        """Say how far a state is off what the plan in use predicted for it, where it is far."""
-        if not state.x or not 0 <= t - state.since <= self.objective.horizon:
-            return ""
-        span = round((t - state.since) / self.step) * self.step
-        ahead = self.loop_at(state).batch(state.x, state.plan, duration=span, terminal=0.0).x[0]
-        n = self.mechanism.n
-        off = float(np.linalg.norm((x - ahead)[:n]))
-        moved = float(np.linalg.norm((ahead - state.x)[:n]))
-        if not off > JUMP + PART * moved:  # a prediction that ended in NaN says nothing
-            return ""
-        return f"; the state is {off:.3g} off the plan's prediction: after a jump, call start again"
+        error = state.error(proposal.computed_for, current)
+        return self._judge.decide(state, proposal, error, span)
 
     @checked
     def survives(self, state: CascadeState, x: ArrayLike, t: float) -> bool:
@@ -999,11 +560,9 @@ class Cascade:
         loop = self.loop_at(state, t)
         if loop.ensemble is None:
             return True
-        return self._survives(loop, state.error(t, self.mechanism.check_state(x)), state.at(t))
-
-    def _survives(self, loop: ClosedLoop, error: FloatArray, plan: Plan) -> bool:
-        event = loop.batch(error, plan, duration=2 * self.period).event[0]
-        return event in (Event.HORIZON, Event.REACHED)
+        return self._judge.survives(
+            loop, state.error(t, self.mechanism.check_state(x)), state.at(t)
+        )
 
     # -- simulation -----------------------------------------------------------------------
 
@@ -1054,19 +613,21 @@ class Cascade:
             where the mechanism cannot rest or go, before anything moves.
         """
         x = self.mechanism.initial_state(x0, state)
-        legs, truths = legs_to(self, target, duration), moving_loops(self, plant)
+        legs, plants = legs_to(self, target, duration), moving_loops(self, plant)
         updates: list[Update] = []
         pieces: list[Trajectory] = []
         memory: CascadeState | None = None
         planned_with: ParameterEstimate | None = None
-        truth, task, arrived = truths[0], -1, False
+        truth, task, arrived = plants[0], -1, False
         spent = since = 0.0  # cost since the last decision; when it was last at the target, s
-        for leg, t, span, due in moments(self, legs, truths):
-            truth = truths.get(round(t / self.stride), truth)
+        for leg, t, span, due in moments(self, legs, plants):
+            truth = plants.get(round(t / self.stride), truth)
             proposal: Proposal | None = None
             if memory is None or t == leg.begin:
                 since = t
-                memory, proposal = self.start_to(x, leg.target, t, memory, leg.longest)
+                memory, proposal = first_plan(
+                    self._planners, self._judge, x, leg.target, t, memory, leg.longest
+                )
                 admission = self.first_admission(memory, x, leg.longest)
             elif np.linalg.norm(memory.error(t, x)) <= self.objective.terminal_radius:
                 since = t
@@ -1074,7 +635,9 @@ class Cascade:
                 left = leg.longest - (t - since)
                 if left <= 0.5 * self.step:  # a disturbed plant came too late: a new horizon
                     since, left = t, leg.longest
-                proposal = self._propose(memory, x, t, left)
+                proposal = next_plan(
+                    self._planners, self._judge, self.resolution, memory, x, t, left
+                )
                 memory, admission = self.apply_gate(memory, proposal, x, left)
             if proposal is not None:
                 task += t == leg.begin or arrived  # left what was reached: another task
@@ -1090,25 +653,3 @@ class Cascade:
             if not (motion.event == Event.HORIZON or (arrived and leg.stays)):
                 break
         return Run(Trajectory.join(pieces), tuple(updates))
-
-
-def _reserved(admission: Admission, plan: Plan, used: Plan) -> Admission:
-    """The admission of the plan that stays; where one in reserve took over, that is admitted."""
-    if admission.accepted or plan is used:
-        return admission
-    return replace(admission, accepted=True, reason=f"a plan in reserve: {admission.reason}")
-
-
-def _kept(x: FloatArray) -> tuple[float, ...]:
-    """Return a state as plain numbers; several of them are none."""
-    return tuple(x.tolist()) if x.ndim == 1 else ()
-
-
-def _costs_along(
-    loop: ClosedLoop, error: FloatArray, plans: list[Plan], target: ReferenceMotion, t: float,
-    span: float,
-) -> list[float]:  # fmt: skip
-    """What each plan costs along a reference from t on, s; infinite where the motion breaks off."""
-    x = error + target.state(t)
-    runs = [simulate_along(loop, x, plan, target, duration=span, start=t) for plan in plans]
-    return [run.cost if run.event in (Event.HORIZON, Event.REACHED) else math.inf for run in runs]

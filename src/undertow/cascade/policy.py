@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from undertow.base import InvalidInputError, checked, positive
-from undertow.cascade.cascade import Cascade, CascadeState
+from undertow.cascade.cascade import Cascade
 from undertow.cascade.simulation import LEARNING, is_news
+from undertow.cascade.state import CascadeState
 from undertow.closed_loop import ClosedLoop
 from undertow.estimators import ParameterEstimate
 from undertow.law import InnerLoop, Plan, Surface

@@ -29,7 +29,8 @@ from undertow.models import FloatArray, Mechanism, number_of
 from undertow.optimiser import Proposal
 
 if TYPE_CHECKING:
-    from undertow.cascade.cascade import Cascade, CascadeState
+    from undertow.cascade.cascade import Cascade
+    from undertow.cascade.state import CascadeState
     from undertow.closed_loop.figures import MotionFigure
     from undertow.display.sketches import Sketch
 

@@ -1,0 +1,212 @@
+"""What is decided of a plan: it stays, gives way to one in reserve, or is replaced."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from undertow.base import InvalidInputError
+from undertow.cascade.predictions import Predictions, costs_along
+from undertow.cascade.reserve import Reserve
+from undertow.cascade.robustness import sticking_distance
+from undertow.cascade.state import CascadeState, as_numbers
+from undertow.closed_loop import ClosedLoop, Event
+from undertow.closed_loop.gate import Admission, Gate, broken_by
+from undertow.law import Plan
+from undertow.models import FloatArray
+from undertow.objective import Objective
+from undertow.optimiser import Proposal
+
+#: How far positions may be off what the plan in use predicted for them before an admission says
+#: so: this much, rad or m, and this part of how far the plan was to move them meanwhile.  A target
+#: that jumps shows in positions at once; what a model does not know shows in velocities first.
+JUMP, PART = 0.1, 0.5
+
+
+class Judge:
+    """Decides on plans, with a cascade's gate and what every plausible plant asks for.
+
+    Parameters
+    ----------
+    predictions, reserve, gate
+        The cascade's.
+    objective
+        Of the task, as the user gave it.
+    recourse
+        Whether plans are for the estimate alone, and later decisions mend them.
+    """
+
+    def __init__(
+        self,
+        predictions: Predictions,
+        reserve: Reserve,
+        gate: Gate,
+        objective: Objective,
+        recourse: bool,
+    ) -> None:
+        self.predictions, self.reserve, self.gate = predictions, reserve, gate
+        self.objective, self.recourse = objective, recourse
+        self.reaching, self.period = reserve.reaching, reserve.period
+        guarded = objective.hard_input or predictions.prior.objective != objective
+        self._bounds_input = predictions.belief is not None and guarded
+
+    def standing(
+        self, state: CascadeState, loop: ClosedLoop, plan: Plan, error: FloatArray, span: float
+    ) -> Plan:
+        """The plan in use, or where it does not suit every plausible plant the best in reserve.
+
+        A plan with which a joint sticks suits none.  One that is to be mended need not suit all.
+        """
+        if loop.ensemble is None:
+            return plan
+        sticks = self._sticks(state, loop, plan) > 0
+        if not sticks and self.mendable(state, loop, plan, error, span):
+            return plan
+        better = self.reserve.better(loop, plan, error, span, sticks)
+        return plan if better is None else better
+
+    def mendable(
+        self, state: CascadeState, loop: ClosedLoop, plan: Plan, error: FloatArray, span: float
+    ) -> bool:
+        """Whether a plan brings the estimate home, and may be mended for the plant later on."""
+        if not self.recourse:
+            return False
+        estimated = self.predictions.estimated_at(state)
+        arrives = estimated.batch(error, plan, duration=span, precise=True).reached[0]
+        return bool(arrives) and self.reserve.recovers(loop, error, plan)
+
+    def breaks(
+        self, state: CascadeState, plans: list[Plan], error: FloatArray, span: float
+    ) -> list[tuple[float, str]]:
+        """When each plan breaks a constraint on the estimate, s, and which; infinite: none does.
+
+        An input that changes with the plan may pass its bound and be back within a step: what suits
+        every plausible plant at the steps of an ensemble is integrated to the tolerance on one.
+        """
+        if not self._bounds_input:
+            return [(math.inf, "")] * len(plans)
+        loop = self.predictions.estimated_at(state)
+        motions = loop.batch(error, plans, duration=span, precise=True)
+        names = [broken_by(loop, motions, k) for k in range(len(plans))]
+        ends = zip(motions.time.tolist(), names, strict=True)
+        return [(t if name else math.inf, name) for t, name in ends]
+
+    def _sticks(self, state: CascadeState, loop: ClosedLoop, plan: Plan) -> float:
+        """How far off a joint sticks on the last surface of a plan; 0 within the terminal set."""
+        if not state.disturbance or loop.ensemble is None:
+            return 0.0
+        law = plan.laws(self.reaching)[-1]
+        size = np.array(state.disturbance)
+        off = sticking_distance(loop.mechanism, plan.surfaces[-1], size, law)
+        return off if off > self.objective.terminal_radius else 0.0
+
+    def ask(self, loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, span: float) -> Admission:
+        """What the gate says of a plan, in the place of an old one."""
+        said = self.gate(loop, old, new, x, span)
+        if not isinstance(said, Admission):
+            raise InvalidInputError(
+                "what the gate of the cascade returned",
+                value=f"{said!r}, a {type(said).__name__}",
+                limit="an undertow.cascade.Admission",
+                remedy="Return one: of undertow.cascade.cost_gate, with conditions of your own",
+            )
+        return said
+
+    def first(self, state: CascadeState, error: FloatArray, span: float) -> Admission:
+        """Put the first plan before the gate: there is no other, so it is used all the same."""
+        loop, plan = self.predictions.at(state, state.since), state.plan
+        if self.mendable(state, loop, plan, error, span):
+            loop = self.predictions.estimated_at(state)
+        asked = self.ask(loop, plan, plan, error, span)
+        reason = "first optimum" if asked.accepted else f"first optimum, although {asked.reason}"
+        return Admission(True, reason, state.predicted, asked.verdict)
+
+    def decide(
+        self, state: CascadeState, proposal: Proposal, error: FloatArray, span: float
+    ) -> tuple[CascadeState, Admission]:
+        """Return the state with the plan that stays in use, and what is said of the proposal.
+
+        ``error`` is how far the present state is off the target.
+        """
+        t = proposal.computed_for
+        jump = self._jump(state, t, error)
+        loop = self.predictions.at(state, t)
+        used = state.at(t)
+        old = self.standing(replace(state, since=t), loop, used, error, span)
+        state = replace(state, plan=old, since=t, sequence=proposal.sequence, x=as_numbers(error))
+        mends, mended = (
+            plan is not None and self.mendable(state, loop, plan, error, span)
+            for plan in (old, proposal.plan)
+        )
+        judge = self.predictions.estimated_at(state) if mends or mended else loop
+        if proposal.plan is None or (mends and not mended):
+            kept = self.ask(judge, old, old, error, span)
+            reason = f"{proposal.status}: {proposal.message or 'no surface'}{jump}"
+            if proposal.plan is not None:
+                reason = f"some plausible plant would not come home after another period{jump}"
+            admission = replace(kept, accepted=False, reason=reason)
+            return replace(state, predicted=kept.cost), _reserved(admission, old, used)
+        admission = self.ask(judge, old, proposal.plan, error, span)
+        off = self._sticks(state, loop, proposal.plan) if admission.accepted else 0.0
+        if off > self._sticks(state, loop, old):
+            cost = self.ask(loop, old, old, error, span).cost
+            most = f"{self.objective.terminal_radius:g} at most"
+            words = f"a joint that sticks is freed by {off:.3g} of the others, {most}"
+            admission = Admission(False, words, cost)
+        if admission.accepted:
+            (before, _), (end, name) = self.breaks(state, [old, proposal.plan], error, span)
+            if end < before:
+                cost = self.ask(loop, old, old, error, span).cost
+                words = f"breaks {name} between two steps, at {end:.3g} s"
+                admission = Admission(False, words, cost)
+        if state.target is not None and state.target.moves:
+            admission = self._along(state, old, proposal.plan, admission, span)
+        admission = replace(admission, reason=f"{admission.reason}{jump}")
+        plan = proposal.plan if admission.accepted else old
+        admission = _reserved(admission, plan, used)
+        return replace(state, plan=plan, predicted=admission.cost), admission
+
+    def _along(
+        self, state: CascadeState, old: Plan, new: Plan, admission: Admission, span: float
+    ) -> Admission:
+        """Judge again what the gate admitted: both plans along the reference, as it will move."""
+        assert state.target is not None  # there is no reference without one
+        loop, error = self.predictions.plausible(state.estimate), np.array(state.x)
+        plans = [old, new] if admission.accepted else [old]
+        costs = costs_along(loop, error, plans, state.target, state.since, span)
+        if not admission.accepted:
+            return replace(admission, cost=costs[0])
+        cost, found = costs
+        if found <= cost and found < math.inf:
+            return replace(admission, cost=found)
+        words = f"raises the cost along the reference: {found:.6g} > {cost:.6g}"
+        return Admission(False, words, cost, admission.verdict)
+
+    def _jump(self, state: CascadeState, t: float, x: FloatArray) -> str:
+        """Say how far a state is off what the plan in use predicted for it, where it is far."""
+        if not state.x or not 0 <= t - state.since <= self.objective.horizon:
+            return ""
+        step = self.predictions.prior.step
+        span = round((t - state.since) / step) * step
+        loop = self.predictions.at(state, state.since)
+        ahead = loop.batch(state.x, state.plan, duration=span, terminal=0.0).x[0]
+        n = len(x) // 2
+        off = float(np.linalg.norm((x - ahead)[:n]))
+        moved = float(np.linalg.norm((ahead - state.x)[:n]))
+        if not off > JUMP + PART * moved:  # a prediction that ended in NaN says nothing
+            return ""
+        return f"; the state is {off:.3g} off the plan's prediction: after a jump, call start again"
+
+    def survives(self, loop: ClosedLoop, error: FloatArray, plan: Plan) -> bool:
+        """Whether every plausible plant lives to see the next decisions with a plan."""
+        event = loop.batch(error, plan, duration=2 * self.period).event[0]
+        return event in (Event.HORIZON, Event.REACHED)
+
+
+def _reserved(admission: Admission, plan: Plan, used: Plan) -> Admission:
+    """The admission of the plan that stays; where one in reserve took over, that is admitted."""
+    if admission.accepted or plan is used:
+        return admission
+    return replace(admission, accepted=True, reason=f"a plan in reserve: {admission.reason}")

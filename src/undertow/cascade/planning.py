@@ -1,0 +1,188 @@
+"""The searches for the first plan of a task, and for the next ones."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from undertow.base import error_text
+from undertow.cascade.judge import Judge
+from undertow.cascade.planners import Planners
+from undertow.cascade.predictions import costs_along
+from undertow.cascade.state import CascadeState, as_numbers
+from undertow.closed_loop import INADMISSIBLE, ClosedLoop
+from undertow.estimators import ParameterEstimate
+from undertow.law import Plan, ReferenceMotion
+from undertow.models import FloatArray
+from undertow.optimiser import Proposal
+
+#: How much more a first plan may cost than the search found, as a factor, before it is searched for
+#: again in smaller steps; and how much smaller they are.
+AGREES, FINER = 1.01, 4
+
+
+class FirstTry(NamedTuple):
+    """An answer to the search for a first plan, and the cost of its plan where it was judged.
+
+    ``rank`` is 0 where it is good, 1 if it is for every plausible plant, 2 if it is for the
+    estimate, 3 where there is none.
+    """
+
+    rank: int
+    cost: float
+    proposal: Proposal
+
+
+def first_plan(
+    planners: Planners,
+    judge: Judge,
+    x: FloatArray,
+    target: ReferenceMotion | None = None,
+    t: float = 0.0,
+    before: CascadeState | None = None,
+    longest: float = math.inf,
+) -> tuple[CascadeState, Proposal]:
+    """Search for the first plan from a state x at the time t, to a target that was checked before.
+
+    The plan is to arrive within ``longest``, s, where one does, else within the objective's
+    horizon.  What ``before`` remembers of the plant is kept.
+
+    Raises
+    ------
+    InfeasibleError
+        When no admissible plan was found.
+    """
+    predictions, belief = planners.predictions, planners.predictions.belief
+    absolute, horizon = x, min(longest, judge.objective.horizon)
+    short = horizon < judge.objective.horizon
+    if target is not None:
+        x = predictions.prior.mechanism.check_state(x) - target.state(t)
+    number, known = 0, None if belief is None else belief.prior
+    if before is not None:
+        number, known = before.sequence + 1, before.estimate or known
+    whole = predictions.plausible(known)
+    here = predictions.about(whole, target, t)
+    here.objective.check_start(here.mechanism, x)
+    # Where nothing suits every plausible plant, what brings home the estimate, without room for
+    # any error: to learn which of the plants it is takes less time than to fall.
+    single = None
+    if belief is not None and known is not None:
+        single = whole.believing(whole.mechanism, belief.single(known))
+    last = [] if single is None else [(single, None)]
+    tries: list[FirstTry] = []
+    for loop, fixed in [*_first_tries(planners, known), *last]:
+        if loop is single and tries[-1].proposal.plan is not None:
+            break
+        about, planner = predictions.about(loop, target, t), planners.of(loop, target, t)
+        if fixed is not None:
+            planner = planners.suited(fixed).on(predictions.about(fixed, target, t))
+        proposal = planner.propose(
+            x, incumbent=None, horizon=horizon if short else None, sequence=0, computed_for=t,
+            resolution=0.0,
+        )  # fmt: skip
+        plan = proposal.plan
+        if plan is None:
+            tries.append(FirstTry(3, math.inf, proposal))
+            continue
+        cost = float(about.batch(x, plan, duration=horizon, precise=True).score(horizon)[0])
+        cost = cost if cost < INADMISSIBLE else math.inf
+        begun = CascadeState(plan, number, cost, cost, t, as_numbers(x), known, target)
+        good = math.isfinite(cost) and math.isinf(judge.breaks(begun, [plan], x, horizon)[0][0])
+        if loop is not whole:  # every plausible plant lives to see the next decision
+            lives = judge.survives if loop.ensemble is not None else judge.reserve.recovers
+            good &= lives(here, x, plan)
+        if loop.ensemble is None and planners.own is None:
+            good &= cost <= AGREES * proposal.cost
+        tries.append(FirstTry(0 if good else 1 if loop is whole else 2, cost, proposal))
+        if good:
+            break
+    best = min(tries, key=lambda one: (one.rank, one.cost))
+    if best.proposal.plan is None and short:
+        return first_plan(planners, judge, absolute, target, t, before)
+    cost, proposal = best.cost, best.proposal
+    plan = proposal.required(here, x).plan
+    assert plan is not None  # required
+    if target is not None and target.moves:  # or the designed surface, where that is better
+        plans = [plan, Plan.of(planners.optimiser.anchor)]
+        costs = costs_along(whole, x, plans, target, t, horizon)
+        k = int(np.argmin(costs))
+        plan, cost = plans[k], costs[k]
+    begun = CascadeState(plan, number, cost, cost, t, as_numbers(x), known, target)
+    return begun, replace(proposal, sequence=number)
+
+
+def _first_tries(
+    planners: Planners, estimate: ParameterEstimate | None
+) -> list[tuple[ClosedLoop, ClosedLoop | None]]:
+    """What the first plan is to be best on, one after the other; and in what steps, if fixed.
+
+    Before anything has moved, what suits every plausible plant suits none of them well: the
+    estimate alone comes first, for a plan that the next decision replaces; a schedule for it
+    without any error before.  Where its plan does not do what it promised, small steps
+    throughout follow: for one plant, which is integrated to the tolerance, smaller ones than
+    usual.
+    """
+    predictions, belief = planners.predictions, planners.predictions.belief
+    whole = predictions.plausible(estimate)
+    if planners.own is not None:
+        return [(whole, None)]
+    loops = [whole]
+    if belief is not None and estimate is not None:
+        loops.insert(0, whole.believing(whole.mechanism, belief.alone(estimate)))
+    if planners.recourse and planners.optimiser.freedom.schedule:
+        loops.insert(0, predictions.estimated(estimate))
+
+    def smaller(loop: ClosedLoop) -> ClosedLoop:
+        adapts = loop.ensemble is None and not loop.zoh_steps
+        return loop.with_steps(predictions.prior.step / FINER, 0.0) if adapts else loop
+
+    return [(loop, fixed) for loop in loops for fixed in (None, smaller(loop))]
+
+
+def next_plan(
+    planners: Planners,
+    judge: Judge,
+    resolution: float,
+    state: CascadeState,
+    x: ArrayLike,
+    t: float,
+    horizon: float | None,
+) -> Proposal:
+    """Re-optimise from a state x at the time t; an exception becomes a status.
+
+    See :meth:`undertow.Cascade.propose`.
+    """
+    predictions, sequence = planners.predictions, state.sequence + 1
+    try:
+        error = state.error(t, predictions.prior.mechanism.check_state(x))
+        span = judge.objective.horizon if horizon is None else horizon
+        here, loop, used = replace(state, since=t), predictions.at(state, t), state.at(t)
+        ask: dict[str, Any] = {
+            "horizon": horizon,
+            "sequence": sequence,
+            "computed_for": t,
+            "resolution": resolution * state.scale,
+        }
+        if planners.recourse:
+            estimated = predictions.estimated(state.estimate)
+            optimiser = planners.optimiser_of(estimated, state.target, t)
+            admits = partial(judge.reserve.recovers, loop, error)
+            first = state.predicted == state.scale  # nothing was decided since
+            promised = 0.0 if first else state.predicted - (t - state.since)
+            found = optimiser.propose(
+                error, incumbent=used, admits=admits, promised=promised, **ask
+            )
+            plans = [used] if found.plan is None else [found.plan, used]
+            if any(judge.mendable(here, loop, plan, error, span) for plan in plans):
+                return found
+        planner = planners.of(predictions.plausible(state.estimate), state.target, t)
+        standing = judge.standing(here, loop, used, error, span)
+        return planner.propose(error, incumbent=standing, **ask)
+    except Exception as error:  # the inner loop must survive whatever the outer loop does
+        said = error_text(error)
+        return Proposal(None, "failed", math.inf, math.inf, (), 0, 0.0, sequence, t, said)

@@ -1,0 +1,74 @@
+"""Plans that are there without a search, and when one of them takes over."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from undertow.closed_loop import INADMISSIBLE, ClosedLoop
+from undertow.law import Plan, ReachingLaw, Surface
+from undertow.models import FloatArray
+
+#: How many times the reaching gains and layers of the plans in reserve are the cascade's: near the
+#: target all are the same feedback, far from it each asks for more input before it saturates.
+STRONGER = (1.0, 2.0, 4.0, 8.0)
+
+
+class Reserve:
+    """The first surface, reached ever more strongly.
+
+    It bears what it was designed for, and a large s brings its law to the limits of the input
+    at once, where the cascade's own reaching law is content with η.
+
+    Parameters
+    ----------
+    first
+        The surface.
+    reaching
+        The cascade's law.
+    period
+        Time between two decisions, s.
+    """
+
+    def __init__(self, first: Surface, reaching: ReachingLaw, period: float) -> None:
+        self.reaching, self.period = reaching, period
+        eta, layer = reaching.per_surface(first.m)
+        laws = [replace(reaching, eta=tuple(c * eta), layer=tuple(c * layer)) for c in STRONGER]
+        self.plans = tuple(Plan((first,), (0.0,), (law,)) for law in laws)
+        self._better = lru_cache(maxsize=2)(self._compare)
+
+    def better(
+        self, loop: ClosedLoop, plan: Plan, error: FloatArray, span: float, sticks: bool
+    ) -> Plan | None:
+        """The plan that is better than one in use, which may stick; ``None``: none is.
+
+        A decision asks twice, for the search and for the gate: the latest answers are kept.
+        """
+        return self._better(loop, plan, error.tobytes(), span, sticks)
+
+    def _compare(
+        self, loop: ClosedLoop, plan: Plan, error: bytes, span: float, sticks: bool
+    ) -> Plan | None:
+        x = np.frombuffer(error).reshape(-1, 2 * loop.mechanism.n)
+        if not sticks and loop.batch(x, plan, duration=span).score(span)[0] < INADMISSIBLE:
+            return None
+        scores = loop.batch(x, [plan, *self.plans], duration=span).score(span)
+        ranks = [(score >= INADMISSIBLE, False, score) for score in scores]
+        ranks[0] = (scores[0] >= INADMISSIBLE, sticks, scores[0])
+        best = min(range(len(ranks)), key=ranks.__getitem__)
+        return self.plans[best - 1] if best else None
+
+    def recovers(self, loop: ClosedLoop, error: FloatArray, plan: Plan) -> bool:
+        """Whether one would bring every plausible plant home after the next period of a plan."""
+        k = sum(t < self.period - 1e-9 for t in plan.times)
+        plans = [
+            Plan(
+                plan.surfaces[:k] + last.surfaces,
+                (*plan.times[:k], self.period),
+                plan.laws(self.reaching)[:k] + last.laws(self.reaching),
+            )
+            for last in self.plans
+        ]
+        return bool(loop.batch(error, plans).reached.any())
