@@ -10,7 +10,8 @@ one.  States are exact; every controller meets the same plants and knows the mod
 kept to the end; *exact* the cascade that takes its model for the plant; *belief* the cascade with a
 belief: an ensemble of what is plausible, learnt as it goes, every 20 ms; *free* the same that may
 choose the reaching law, too; *schedule* one that chooses surfaces with reaching laws, each for
-0.05 s.  Their law acts continuously.
+0.05 s.  Their law acts continuously,
+or with ``--hold`` is sampled, its input held.
 
 *lqr* is clipped linear-quadratic feedback, continuous too, the best on the model of 39 weights,
 by hindsight.  *predictive* plans anew a hundred times a second and holds its input in between: for
@@ -86,6 +87,8 @@ FREEDOMS = {
 OURS = ("kept", "exact", "belief", "free", "schedule")
 PEERS = ("lqr", "predictive", "learnt", "scenario")
 CONTROLLERS = (*OURS, *PEERS, "acados")
+#: Longest step of a loop whose input is held, s: the library's usual one.
+LONGEST = 0.002
 #: Of the travel, what predictive control plans with; how far it lets angles lean that it does not
 #: drive; and how far they may lean at all.
 PLANNED, LEANING, FALLEN = 0.9, math.radians(85), math.pi / 2
@@ -93,11 +96,12 @@ PLANNED, LEANING, FALLEN = 0.9, math.radians(85), math.pi / 2
 
 @dataclass(frozen=True)
 class Task:
-    """A mechanism, an objective and a start, (2n,)."""
+    """A mechanism, an objective, a start, (2n,), and for how long our law's input is held, s."""
 
     mechanism: str
     objective: Literal["energy", "time"]
     start: tuple[float, ...]
+    hold: float = 0.0
 
     @property
     def rig(self) -> ut.Mechanism:
@@ -113,6 +117,14 @@ class Task:
     def x0(self) -> FloatArray:
         """The start."""
         return np.array(self.start)
+
+    @property
+    def steps(self) -> dict[str, Any]:
+        """Steps of our loops, 2 ms or a little less, some in a sample where the input is held."""
+        if not self.hold:
+            return {}
+        count = math.ceil(self.hold / LONGEST - 1e-9)
+        return {"step": self.hold / count, "zoh_steps": count}
 
 
 Job = tuple[Task, int]
@@ -186,18 +198,19 @@ def box(name: str, travel: float, lean: float) -> Box:
 
 
 @cache
-def cascade(name: str, objective: str, controller: str) -> ut.Cascade:
+def cascade(name: str, objective: str, controller: str, hold: float = 0.0) -> ut.Cascade:
     """Return a cascade; one for each process."""
     rig, aim = model(name), OBJECTIVES[objective]
+    steps = Task(name, objective, (), hold).steps  # type: ignore[arg-type]
     if controller in FREEDOMS:
-        return ut.Cascade(rig, aim, belief=belief(name), freedom=FREEDOMS[controller])
-    return ut.Cascade(rig, aim, belief="exact")
+        return ut.Cascade(rig, aim, belief=belief(name), freedom=FREEDOMS[controller], **steps)
+    return ut.Cascade(rig, aim, belief="exact", **steps)
 
 
 @cache
 def first_optimum(task: Task) -> ut.Surface:
     """Return the first surface of the cascade with a belief."""
-    memory, _ = cascade(task.mechanism, task.objective, "belief").start(task.x0)
+    memory, _ = cascade(task.mechanism, task.objective, "belief", task.hold).start(task.x0)
     return memory.plan.surfaces[0]
 
 
@@ -206,10 +219,10 @@ def ours(task: Task, controller: str, plant: ut.Mechanism) -> tuple[str, float]:
     motion: Any
     try:
         if controller == "kept":
-            loop = ut.ClosedLoop(task.rig, task.aim, plant=plant)
+            loop = ut.ClosedLoop(task.rig, task.aim, plant=plant, **task.steps)
             motion = loop.simulate(task.x0, first_optimum(task))
         else:
-            run = cascade(task.mechanism, task.objective, controller)
+            run = cascade(task.mechanism, task.objective, controller, task.hold)
             motion = run.simulate(task.x0, plant=plant).trajectory
     except UndertowError as error:
         return type(error).__name__, math.inf
@@ -331,6 +344,7 @@ def shown(task: Task, here: list[Outcome], seed: str) -> None:
     plants = len({one.plant for one in here})
     title = f"{task.mechanism}, {task.objective}, {unit}, from "
     title += f"{state_words(task.rig, task.x0)}, {plants} plants, {seed}"
+    title += f", our input held for {1e3 * task.hold:g} ms" if task.hold else ""
     table(title, header, [row(group, kept) for group in groups if group])
 
 
@@ -405,6 +419,9 @@ def main() -> int:
     )
     parser.add_argument("--objective", choices=tuple(OBJECTIVES), action="append", help="both")
     parser.add_argument(
+        "--hold", type=float, default=0.0, help="ms for which our input is held; 0: continuous"
+    )
+    parser.add_argument(
         "--controller", choices=CONTROLLERS, action="append", help="all that are there"
     )
     parser.add_argument("--acados", help="a Python that has acados; $UNDERTOW_ACADOS")
@@ -413,6 +430,8 @@ def main() -> int:
     parser.add_argument("--out", type=Path, help="a CSV file for every single outcome")
     asked = parser.parse_args()
     plants = 2 if asked.quick else asked.plants
+    if not 0 <= asked.hold <= 100:
+        parser.error("--hold must be 0 to 100 ms: 0 is continuous, 1 a loop of 1 kHz")
     if plants < 1 or asked.workers < 1:
         parser.error("--plants and --workers must be at least 1")
     if asked.acados:
@@ -432,7 +451,7 @@ def main() -> int:
     factors = asked.start or ([1.0] if asked.quick and asked.mechanism else None)
     aims: list[Any] = asked.objective or list(OBJECTIVES)[: 1 if asked.quick else None]
     tasks = [
-        Task(name, aim, tuple(map(float, x0)))
+        Task(name, aim, tuple(map(float, x0)), 1e-3 * asked.hold)
         for name in names
         for aim in aims
         for x0 in starts(name, factors, angles)

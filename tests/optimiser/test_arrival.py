@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -136,6 +138,26 @@ def test_the_better_basin_is_found() -> None:
     first, last = optimiser.improve(rig.state(phi=ut.deg(40)))
     assert first.cost > 1.4
     assert last.cost < 1.15
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"step": 0.001, "zoh_steps": 1},
+        {"reaching": ut.ReachingLaw(switching="sign")},
+        {"plant": ut.mechanisms.rotary_pendulum(d_e=0.025).with_parameters(m=0.13)},
+    ],
+    ids=["held for 1 ms", "discontinuous", "on another plant"],
+)
+def test_a_loop_without_a_linear_model_arrives_about_as_early(other: dict[str, Any]) -> None:
+    """An input held, a law that switches, a plant that is not the model: arrivals all the same."""
+    rig = ut.mechanisms.rotary_pendulum(d_e=0.025)
+    x0, few = rig.state(phi=ut.deg(20)), ut.Budget(8192)
+    usual, found = (
+        ut.Optimiser(ut.ClosedLoop(rig, ut.MinimumTime(), **how)).propose(x0, budget=few)
+        for how in ({}, other)
+    )
+    assert found.cost <= 1.02 * usual.cost
 
 
 @pytest.mark.slow

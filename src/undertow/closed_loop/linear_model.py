@@ -53,6 +53,11 @@ class QuadraticStage:
     xu: FloatArray
     uu: FloatArray
 
+    @property
+    def quadratic(self) -> bool:
+        """Whether state or input cost anything near the target."""
+        return bool(np.abs(self.xx).max() + np.abs(self.uu).max() > 0)
+
 
 def quadratic_stage(mechanism: Mechanism, stage: sp.Expr) -> QuadraticStage | None:
     """Return the second-order model of a Φ at the target; ``None`` where there is none.
@@ -142,7 +147,7 @@ class TerminalLinearModel:
             0.0, np.zeros((2 * n, 2 * n)), np.zeros((2 * n, m)), np.zeros((m, m))
         )
         # Where Φ has no quadratic part (minimum time) the state itself must be exact.
-        self.counts_cost = bool(np.abs(self._weights.xx).max() + np.abs(self._weights.uu).max() > 0)
+        self.counts_cost = self._weights.quadratic
         self._bounded = np.array([i for i, _ in objective.boxes(mechanism)], dtype=np.int64)
         self._blocks = linear_blocks(2 * n)
         self._take(mechanism, ensemble)

@@ -35,7 +35,7 @@ from undertow.closed_loop.buffers import NOTHING, RolloutBuffers
 from undertow.closed_loop.ensemble import TAIL, Ensemble, summarise
 from undertow.closed_loop.exponential_integrator import GIVEN_BACK
 from undertow.closed_loop.kernel import compile_look, compile_loop
-from undertow.closed_loop.linear_model import Prepared, TerminalLinearModel
+from undertow.closed_loop.linear_model import Prepared, TerminalLinearModel, quadratic_stage
 from undertow.closed_loop.threads import shared
 from undertow.closed_loop.trajectory import Batch, Event, Trajectory, recorded
 from undertow.closed_loop.work_array import LANES
@@ -282,10 +282,8 @@ class ClosedLoop:
     @cached_property
     def counts_time(self) -> bool:
         """Whether the cost is the time of arrival, a discontinuous function of the plan."""
-        end = self.linear_end
-        if end is None or end.stage is None:
-            return False
-        return end.stage.rest > 0 and not end.counts_cost
+        stage = quadratic_stage(self.mechanism, self.objective.stage_cost(self.mechanism))
+        return stage is not None and stage.rest > 0 and not stage.quadratic
 
     @cached_property
     def takes_large_steps(self) -> bool:
