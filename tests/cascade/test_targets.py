@@ -199,12 +199,13 @@ def test_the_travel_is_a_constraint_about_a_target_too() -> None:
 
 
 def test_each_target_is_seen_from_itself() -> None:
-    """Of two targets in turn each has its own distance to the stops, of one structure."""
+    """Of two targets in turn each has its own distance to the stops, of one set of formulas."""
     cascade = ut.Cascade(CRANE, ut.MinimumEnergy(horizon=8.0), belief="exact")
     legs = [legs_to(cascade, ut.SetPoints({"x": x}), 8.0)[0] for x in (1.0, -0.5, 1.0)]
     loops = [cascade.about(cascade.loop, leg.target, 0.0) for leg in legs]
     assert [loop.mechanism.parameter_values[-1] for loop in loops] == [1.0, -0.5, 1.0]
     assert [loop.mechanism.structure for loop in loops[1:]] == 2 * [loops[0].mechanism.structure]
+    assert all(loop.objective is loops[0].objective for loop in loops)
 
 
 @pytest.mark.parametrize("target", [None, ut.Reference.sine(0.5, theta=0.3)], ids=["0", "sine"])

@@ -18,7 +18,7 @@ import pytest
 import undertow as ut
 from undertow.models import FloatArray
 from undertow.proofs.claims.model_data import law_of, model_of
-from undertow.proofs.kernel.graph import Graph
+from undertow.proofs.kernel.graph import Graph, Span
 from undertow.proofs.kernel.model import System
 from undertow.proofs.kernel.tube import Field, Tube
 
@@ -205,6 +205,14 @@ def test_zero_times_undefined_is_undefined() -> None:
     assert np.isnan(values[0]).all()
     assert graph.value(nodes[1]) == 0
     assert np.isnan(values[2]).all()
+
+
+@pytest.mark.parametrize(("kind", "at"), [("log", 0), ("log", -1), ("sqrt", -1), ("exp", 1000)])
+def test_no_number_is_made_of_what_is_undefined_or_too_large(kind: str, at: int) -> None:
+    """Whether one of its ends is no number or both are."""
+    graph = Graph(1)
+    with pytest.raises(ZeroDivisionError, match=f"{kind} of a number"):
+        graph.exact([graph.make(kind, graph.inputs[0])], [Span(Fraction(at))])
 
 
 def test_a_root_of_a_square_is_no_way_round_a_kink() -> None:
