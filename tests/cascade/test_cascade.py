@@ -9,6 +9,7 @@ import traceback
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -424,6 +425,14 @@ def test_a_run_ends_when_it_was_asked_to(rig: ut.Mechanism, duration: float) -> 
     run = cascade.simulate(phi=0.3, duration=duration)
     assert run.time == pytest.approx(duration, abs=1e-15)
     assert len(run.trajectory.t) == 18 if duration > 0.033 else 17
+
+
+def test_what_is_no_figure_is_not_filmed(run: ut.Run, tmp_path: Path) -> None:
+    film = tmp_path / "film.gif"
+    figure: Any = "stick"
+    with pytest.raises(InvalidInputError, match="figure of an animation"):
+        run.animate(film, figure=figure)
+    assert not film.exists()
 
 
 def test_what_is_no_planner_or_no_verdict_of_a_gate_is_refused(rig: ut.Mechanism) -> None:

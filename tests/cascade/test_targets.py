@@ -9,6 +9,7 @@ import pytest
 
 import undertow as ut
 from undertow.base import InvalidInputError
+from undertow.cascade import CascadeState
 from undertow.cascade.simulation import legs_to, moments
 
 CRANE = ut.mechanisms.overhead_crane()
@@ -198,9 +199,24 @@ def test_the_travel_is_a_constraint_about_a_target_too() -> None:
 
 
 def test_each_target_is_seen_from_itself() -> None:
-    """Of two targets in turn each has its own distance to the stops, of one structure."""
+    """Of two targets in turn each has its own distance to the stops, of one set of formulas."""
     cascade = ut.Cascade(CRANE, ut.MinimumEnergy(horizon=8.0), belief="exact")
     legs = [legs_to(cascade, ut.SetPoints({"x": x}), 8.0)[0] for x in (1.0, -0.5, 1.0)]
     loops = [cascade.about(cascade.loop, leg.target, 0.0) for leg in legs]
     assert [loop.mechanism.parameter_values[-1] for loop in loops] == [1.0, -0.5, 1.0]
     assert [loop.mechanism.structure for loop in loops[1:]] == 2 * [loops[0].mechanism.structure]
+    assert all(loop.objective is loops[0].objective for loop in loops)
+
+
+@pytest.mark.parametrize("target", [None, ut.Reference.sine(0.5, theta=0.3)], ids=["0", "sine"])
+def test_what_is_predicted_in_one_go_is_predicted_in_two(
+    rig: ut.Mechanism, quick: ut.Surface, target: ut.Reference | None
+) -> None:
+    """Flows compose, whenever they begin; beside a target that moves, too."""
+    cascade = ut.Cascade(rig, ut.MinimumEnergy(), belief="exact")
+    motion = None if target is None else target.legs(rig, 4.0)[0][1]
+    state, error = CascadeState(ut.Plan.of(quick), target=motion), rig.state(phi=0.2)
+    halfway = cascade.predicted_error(state, error, 1.0, 1.2)
+    later = cascade.predicted_error(state, error, 1.0, 1.5)
+    assert np.linalg.norm(later - error) > 0.1
+    assert cascade.predicted_error(state, halfway, 1.2, 1.5) == pytest.approx(later, rel=1e-5)

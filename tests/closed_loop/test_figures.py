@@ -45,6 +45,14 @@ def test_input_is_drawn_in_its_unit(motion: ut.Trajectory) -> None:
     assert axes.get_ylabel() == "voltage (V)"
 
 
+def test_labels_of_the_panels_are_in_line(motion: ut.Trajectory) -> None:
+    """However wide the numbers beside them are."""
+    figure = figures.motion_figure({"motion": motion})
+    figure.draw_without_rendering()
+    ends = [panel.yaxis.label.get_window_extent().x1 for panel in figure.axes]
+    assert np.ptp(ends) < 1  # pixel
+
+
 @pytest.mark.parametrize("kind", ["png", "pdf"])
 def test_same_motion_same_picture_bit_for_bit(motion: ut.Trajectory, kind: str) -> None:
     """Drawing is deterministic: no date, no random identifier."""

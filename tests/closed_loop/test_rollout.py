@@ -478,19 +478,22 @@ def test_constraints_end_a_motion_and_margins_are_the_smallest_met(
 
     calm = rig.state(phi=0.15)
     run, batch = loop.simulate(calm, quick), loop.batch(calm, [quick])
-    assert run.event == ut.Event.REACHED
+    assert (run.event, run.broken) == (ut.Event.REACHED, "")
     found = np.array([batch.input[0], *batch.path[0]])
     np.testing.assert_allclose(found, margins(run), rtol=1e-9)
     assert (found > 0).all()
 
     # Too far out, the law asks for more than 15 V; from an arm turned away, for too much arm.
-    for x0, which in ((rig.state(phi=0.8), 0), (rig.state(theta=1.0, theta_dot=2.0), 1)):
+    turned = rig.state(theta=1.0, theta_dot=2.0)
+    for x0, which, word in ((rig.state(phi=0.8), 0, "input"), (turned, 1, "theta")):
         batch = loop.batch(x0, [quick])
         assert batch.event[0] == ut.Event.CONSTRAINT
         found = np.array([batch.input[0], *batch.path[0]])
         assert found[which] < 0
         assert batch.time[0] < 0.5
-    assert loop.simulate(rig.state(phi=0.8), quick).event == ut.Event.CONSTRAINT
+        run = loop.simulate(x0, quick)
+        assert run.event == ut.Event.CONSTRAINT
+        assert word in run.broken
 
 
 def test_a_hard_input_limit_is_tight(

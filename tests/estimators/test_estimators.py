@@ -24,7 +24,7 @@ from undertow.estimators import (
     compensated,
     run_recorded,
 )
-from undertow.estimators.recorded_run import subtract_disturbance
+from undertow.estimators.recorded_run import Record, subtract_disturbance
 from undertow.law import InnerLoop
 from undertow.plants import Bench, IdealRig, Measurement, RealisticRig, Timing, srv02_rig
 from undertow.runtime import Recipe
@@ -245,6 +245,15 @@ def test_senseless_settings_are_refused(arm: ut.Mechanism) -> None:
 
 
 #: An estimator that knows of half a unit of disturbance.
+def test_the_effort_of_a_run_is_that_of_its_inputs_held_from_sample_to_sample() -> None:
+    """(40) of a stair: the last sample is held as long as the one before, a sole one not at all."""
+    t, u = np.array([5.0, 5.1, 5.3]), np.array([[1.0], [2.0], [3.0]])
+    nothing = np.full((3, 2), np.nan)
+    assert Record(t, nothing, nothing, u, nothing).effort == pytest.approx(0.1 + 0.8 + 1.8)
+    one = nothing[:1]
+    assert Record(t[:1], one, one, u[:1], one).effort == 0
+
+
 STILL: Any = SimpleNamespace(disturbance=np.array([0.5]))
 
 

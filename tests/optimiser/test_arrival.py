@@ -9,7 +9,7 @@ import pytest
 
 import undertow as ut
 from support import rest_slow
-from undertow.optimiser.arrival import ArrivalSearch, FloatArray, _steps
+from undertow.optimiser.arrival import ArrivalSearch, FloatArray, _steps, closer
 
 RADIUS = 1e-3
 
@@ -89,6 +89,19 @@ def test_steps_are_those_of_the_normal_equations() -> None:
             wanted = -np.linalg.solve(J[k].T @ J[k] + damping[k, j] * np.eye(3), J[k].T @ x[k])
             wanted *= min(1.0, 0.5 / np.linalg.norm(wanted))
             np.testing.assert_allclose(steps[k, j], wanted, rtol=1e-9)
+
+
+def test_damping_falls_with_a_step_that_helps_and_rises_with_one_that_does_not() -> None:
+    """Marquardt's rule (1963): steps of Newton where the model holds, else short ones downhill."""
+    z, t, damping = np.full((3, 2), 0.1), np.zeros(3), np.array([1e-2, 1e-1, 1.0])
+    _, x, _, after = closer(lambda z: (z, np.zeros(len(z))), z, z, t, damping)
+    assert (np.linalg.norm(x, axis=1) < np.linalg.norm(z, axis=1)).all()
+    assert (after < damping).all()
+    flat = np.ones_like(z)
+    same, x, _, after = closer(lambda z: (np.ones_like(z), np.zeros(len(z))), z, flat, t, damping)
+    np.testing.assert_array_equal(same, z)
+    np.testing.assert_array_equal(x, flat)
+    assert (after > damping).all()
 
 
 SEEDS = range(1), pytest.param(range(1, 14), marks=pytest.mark.slow)

@@ -33,7 +33,7 @@ def test_it_is_the_mean_of_the_posterior(starts: int, seen: int) -> None:
 
 def test_ends_within_one_percent_are_one_and_failures_are_none() -> None:
     assert confidence([1.0, 1.009, math.inf, 1.005]) == pytest.approx(1 / 2)
-    assert confidence([1.0, 1.02, 1.04]) == 0.0
+    assert confidence([1.0, 1.02, 1.04]) == confidence([1.0, 2.0]) == 0.0
     assert confidence([-1.0, -1.001, -1.002, -1.003]) == pytest.approx(2 / 3)
     assert confidence([0.0, 0.0, 0.0]) == pytest.approx(1 / 2)
 

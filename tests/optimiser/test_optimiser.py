@@ -299,6 +299,14 @@ def test_state_that_is_not_a_number_is_refused(optimisers: dict[str, ut.Optimise
         optimisers["time"].propose([0.0, np.nan, 0.0, 0.0])
 
 
+@pytest.mark.parametrize("ask", [ut.Optimiser.propose, ut.Optimiser.improve])
+def test_a_sequence_below_zero_is_refused_at_once(
+    optimisers: dict[str, ut.Optimiser], ask: Any
+) -> None:
+    with pytest.raises(InvalidInputError, match="sequence of a proposal"):
+        ask(optimisers["time"], [0.0, 0.3, 0.0, 0.0], sequence=-1)
+
+
 def test_a_start_beyond_half_a_turn_is_told_what_it_is_but_for_a_turn(rig: ut.Mechanism) -> None:
     """350° of the pendulum are −10°; where a spring counts the turns nothing is said."""
     nothing = Proposal(None, "infeasible", math.inf, math.inf, (), 1, 0.0, 0, 0.0, "no", "Wait")

@@ -39,6 +39,14 @@ def earliest(name: str) -> OpenLoopMotion:
     return found
 
 
+def test_surfaces_of_a_schedule_are_drawn_together_and_each_a_little_by_itself() -> None:
+    space = cascade("rotary_pendulum").optimiser.space.at((0.0, 0.1, 0.2))
+    drawn = space.steps(np.random.default_rng(2), np.full(4000, 0.5)).reshape(4000, 3, -1)
+    together = drawn.mean(axis=1, keepdims=True)
+    assert 0 < (drawn - together).std() < 0.5 * together.std()
+    assert together.std() == pytest.approx(0.5, rel=0.1)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["rotary_pendulum", pytest.param("overhead_crane", marks=pytest.mark.slow)]

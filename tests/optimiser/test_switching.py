@@ -7,9 +7,11 @@ import pytest
 
 import undertow as ut
 from undertow.law import SlidingModeLaw
+from undertow.optimiser.arrival import ArrivalSearch
 from undertow.optimiser.fitting import switching_fits
 from undertow.optimiser.open_loop import OpenLoopMotion
 from undertow.optimiser.schedules import earliest_arrival, earliest_motion
+from undertow.optimiser.switching import DRAWN, GENERATIONS, MEMBERS, SwitchingSurfaces
 from undertow.optimiser.task import Optimisation
 
 
@@ -67,6 +69,17 @@ def test_the_law_asks_for_no_input_where_the_motion_switches(
         agrees = along[held] * before[held] > 0.0
         small.append(np.abs(u).max() < 0.05 * limit and agrees.all())
     assert sum(small) >= 3
+
+
+def test_a_search_around_the_fits_is_not_begun_that_cannot_be_ended(
+    earliest: tuple[Optimisation, OpenLoopMotion],
+) -> None:
+    """Where what is left would do for the draws and the generations, and for no arrival."""
+    task, motion = earliest
+    left, spent = DRAWN + MEMBERS * GENERATIONS, task.evaluations
+    arrivals = ArrivalSearch(task.states, lambda z: z[:, 0] > 0, 1e-3, lambda count: count > left)
+    assert SwitchingSurfaces(task.firsts, motion.time).search(task, arrivals) == np.inf
+    assert task.evaluations == spent
 
 
 @pytest.mark.slow

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 import sympy as sp
@@ -115,6 +117,17 @@ def test_around_a_state_far_along_the_slow_mode() -> None:
     assert found.contains(x)
     assert found.decide(RIG, surface, LAW)
     assert search.around(RIG.state(phi=0.5)) is None
+
+
+def test_rounding_takes_nothing_outside_for_inside() -> None:
+    """Of states that a row of W all but cancels, with a radius just not beyond them: exactly."""
+    rng, W = np.random.default_rng(5), np.zeros((2, 2))
+    for row in 1e6 * rng.normal(size=(40, 2)):
+        W[0], x = row, np.array([row[1], -row[0]]) / 1e6
+        exact = abs(sum(Fraction(a) * Fraction(b) for a, b in zip(row, x, strict=True)))
+        if exact:
+            radius = np.nextafter(float(exact), 0)
+            assert not TerminalEllipsoid(W, W, radius).contains(x)
 
 
 def test_conditions_that_break_are_named() -> None:

@@ -7,6 +7,7 @@ import math
 import pytest
 import sympy as sp
 
+from undertow.base import ModelError
 from undertow.proofs.claims.model_data import _Writer
 from undertow.proofs.exact_model import is_odd
 from undertow.proofs.kernel.reader import number
@@ -32,6 +33,13 @@ def test_whole_and_half_powers_are_written_as_what_they_are(exponent: str) -> No
         for word, *data in graph.nodes:
             values.append(_value(word, data, values))
         assert values[last] == pytest.approx(float(expression.subs(x, 0.25)), rel=1e-15)
+
+
+@pytest.mark.parametrize("exponent", ["1/3", "3/4", "-3/4", "65"])
+def test_other_powers_are_refused(exponent: str) -> None:
+    x = sp.Symbol("x", real=True)
+    with pytest.raises(ModelError, match="whole or half"):
+        _Writer({x: ["x"]}, {}).of((x + 2) ** sp.Rational(exponent))
 
 
 def _value(word: str, data: list[int], values: list[float]) -> float:

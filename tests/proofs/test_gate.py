@@ -212,6 +212,10 @@ def test_sets_that_were_proved_before_are_used() -> None:
     only = GatePolicy(("region",))
     assert assess(LOOP, Plan.of(GOOD), FAR, 20.0, only, [other]).kind == "undecided"
     assert assess(LOOP, Plan.of(GOOD), FAR, 20.0, only, [other, here]).kind == "proved"
+    faster = ut.ReachingLaw(eta=40.0)
+    plan = Plan((GOOD,), (0.0,), (faster,))
+    assert assess(LOOP, plan, FAR, 20.0, only, [here]).kind == "undecided"
+    assert assess(LOOP, plan, FAR, 20.0, only, [replace(here, reaching=faster)]).kind == "proved"
 
 
 def test_a_schedule_is_judged_by_its_last_surface() -> None:

@@ -18,7 +18,8 @@ import pytest
 import undertow as ut
 from undertow.models import FloatArray
 from undertow.proofs.claims.model_data import law_of, model_of
-from undertow.proofs.kernel.graph import Graph
+from undertow.proofs.kernel.bound import Goal, settle
+from undertow.proofs.kernel.graph import Graph, Span
 from undertow.proofs.kernel.model import System
 from undertow.proofs.kernel.tube import Field, Tube
 
@@ -207,6 +208,14 @@ def test_zero_times_undefined_is_undefined() -> None:
     assert np.isnan(values[2]).all()
 
 
+@pytest.mark.parametrize(("kind", "at"), [("log", 0), ("log", -1), ("sqrt", -1), ("exp", 1000)])
+def test_no_number_is_made_of_what_is_undefined_or_too_large(kind: str, at: int) -> None:
+    """Whether one of its ends is no number or both are."""
+    graph = Graph(1)
+    with pytest.raises(ZeroDivisionError, match=f"{kind} of a number"):
+        graph.exact([graph.make(kind, graph.inputs[0])], [Span(Fraction(at))])
+
+
 def test_a_root_of_a_square_is_no_way_round_a_kink() -> None:
     """√(x²) is refused where x may be 0, and is |x| elsewhere."""
     graph = Graph(1)
@@ -215,6 +224,20 @@ def test_a_root_of_a_square_is_no_way_round_a_kink() -> None:
     low, high = root(np.array([-2.0]), np.array([-1.0]))[0, 0]
     assert low <= 1.0
     assert 2.0 <= high < 2.0001
+
+
+def test_what_touches_its_bound_is_left_open_where_it_does() -> None:
+    """(x² − 2)² > 0 but at √2, which is no double: boxes around it are not halved for ever."""
+    graph = Graph(1)
+    gap = graph.make("sub", graph.make("sqr", graph.inputs[0]), graph.number(2))
+    program = graph.program([graph.make("sqr", gap)])
+    box, none = [(Fraction(1), Fraction(2))], np.empty((0, 2))
+    found = settle(program, box, none, [Goal("more than 0")], max_boxes=5000)
+    assert (found.kind, found.why) == ("undecided", "more than 0")
+    assert found.point[0] == pytest.approx(2**0.5, rel=1e-6)
+    assert found.boxes < 1000
+    beside = settle(program, [(Fraction(1), Fraction(7, 5))], none, [Goal("more than 0")], 5000)
+    assert beside.kind == "proved"
 
 
 # -- tubes ----------------------------------------------------------------------------------------

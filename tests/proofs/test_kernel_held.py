@@ -19,6 +19,7 @@ import undertow as ut
 from undertow.base import InvalidInputError
 from undertow.law import ReachingLaw, SlidingModeLaw
 from undertow.models import FloatArray
+from undertow.proofs.claims.closed_loop import LoopClaim
 from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.claims import ClosedLoop, TerminalEllipsoid, decide, read_claim
@@ -435,6 +436,16 @@ def test_kept_starts_of_the_sampled_loop_are_proved_from_their_file(
         found = decide(MODEL, law, replace(own, starts={"phi": (low, high)}))
         assert found.kind == "proved", found.why
         assert found.details["tubes"] < 12
+
+
+def test_the_terminal_set_of_a_held_input_is_told_in_states() -> None:
+    """Near the target W of x is W of (q, P, s), P = (M q̇)_u."""
+    W_x, radius = LoopClaim(claim(phi=0.1).data()).terminal(RIG, SURFACE)
+    assert radius == float(END.radius)
+    for x in 1e-6 * np.random.default_rng(3).normal(size=(4, 4)):
+        z = [*x[:2], (RIG.M(x[:2]) @ x[2:])[1], *SlidingModeLaw(RIG, SURFACE)(0.0, x).s]
+        size = float(np.abs(W).max() * np.abs(x).max())
+        np.testing.assert_allclose(W_x @ x, np.array(W) @ z, rtol=0, atol=1e-5 * size)
 
 
 def kept(name: str) -> list[ClosedLoop]:

@@ -278,6 +278,15 @@ KINKS = {
 }
 
 
+def test_the_ball_of_an_ellipsoid_is_the_largest_inside() -> None:
+    """ρ/‖W‖₂ by singular values, and not more."""
+    for size in (1e-3, 1.0, 1e3):
+        W = size * np.random.default_rng(4).normal(size=(4, 4))
+        exact = tuple(tuple(Fraction(v) for v in row) for row in W)
+        found, largest = kernel.TerminalEllipsoid(exact, Fraction(2)).ball, 2 / np.linalg.norm(W, 2)
+        assert (1 - 1e-9) * largest < found <= largest
+
+
 @pytest.mark.parametrize("name", KINKS)
 def test_a_kinked_model_cannot_be_written(name: str) -> None:
     with pytest.raises(ModelError):

@@ -289,6 +289,28 @@ def test_first_sets_keep_clear_of_the_singularity_and_of_the_pole(bent: bool) ->
     assert 0.9 * end < extent(V, [1.0, 0.0]) <= end * (1 + 1e-6)
 
 
+def test_the_first_set_that_is_searched_for_reaches_the_end_of_the_basin() -> None:
+    """Of ẋ = −x + x³ that is 1; the one that is merely as large as samples allow stops short."""
+    x = sp.Symbol("x", real=True)
+    motion: Any = VectorField((x,), (-x + x**3,))
+    far, plain = (
+        extent(quadratic(motion, None, np.ones(1), np.random.default_rng(0), start), np.ones(1))
+        for start in ("far", "round")
+    )
+    assert plain < 0.99 < far < 1.0
+
+
+def test_a_set_grows_and_motions_come_back_through_all_that_is_new() -> None:
+    """By one linear program, inside the basin; V falls from its edge to that of the set before."""
+    x = sp.Symbol("x", real=True)
+    motion: Any = VectorField((x,), (-x + x**3,))
+    way, first = np.ones(1), LyapunovFunction.quadratic(np.array([[0.5]]))
+    (V,) = grow(motion, first, way, 4, SearchBudget(1, INF), INF, np.random.default_rng(0))
+    assert 1.01 * extent(first, way) < extent(V, way) < 1
+    new = np.linspace(extent(first, way), extent(V, way), 50)[:, None]
+    assert (V(new + 1e-4 * motion(new)) < V(new)).all()
+
+
 @pytest.mark.slow
 def test_a_chain_grows_within_its_budget() -> None:
     """Each set reaches further than the one before; programs are counted; a goal ends it."""

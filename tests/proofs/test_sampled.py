@@ -31,9 +31,12 @@ def test_the_bound_on_failures_covers() -> None:
         bounds = {k: failure_bound(int(k), 500, 0.95) for k in np.unique(counts)}
         missed = np.mean([bounds[k] < p for k in counts])
         assert missed <= 0.05 + 3 * np.sqrt(0.05 * 0.95 / 2000)
+    for trials in (1, 10, 3000):  # where none fails: (1 − p)^N = 1 − confidence
+        assert failure_bound(0, trials, 0.95) == pytest.approx(1 - 0.05 ** (1 / trials), rel=1e-9)
     assert failure_bound(7, 7) == 1.0  # of what never succeeds nothing is known
-    with pytest.raises(InvalidInputError):
-        failure_bound(3, 2)
+    for failures, trials, confidence in ((3, 2, 0.9), (0, 0, 0.9), (0, 9, 0.0), (0, 9, 1.0)):
+        with pytest.raises(InvalidInputError):
+            failure_bound(failures, trials, confidence)
 
 
 def test_sampled_starts_converge_or_are_refuted_with_a_witness() -> None:

@@ -42,7 +42,7 @@ class Record:
     @property
     def effort(self) -> float:
         """∫ uᵀu dt of the inputs written, held from sample to sample, (40)."""
-        span = np.diff(self.t, append=2 * self.t[-1] - self.t[-2] if len(self.t) > 1 else 0.0)
+        span = np.diff(self.t, append=self.t[-1] + np.diff(self.t[-2:]).sum())
         return float((self.u**2).sum(axis=1) @ span)
 
     @property

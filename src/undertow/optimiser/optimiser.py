@@ -206,7 +206,6 @@ class Optimiser:
         Proposal
             Always; an infeasible task is a status and not an exception.
         """
-        at_least("sequence of a proposal", sequence, 0)
         warm = incumbent is not None
         longest = self.loop.objective.horizon if horizon is None else horizon
         task = self._task(x, longest, budget or self._budget(warm), resolution, sequence, warm)
@@ -240,7 +239,6 @@ class Optimiser:
         budget
             Overrides ``cold``, for all answers together.
         """
-        at_least("sequence of a proposal", sequence, 0)
         longest = self.loop.objective.horizon
         task = self._task(x, longest, budget or self._budget(False), 0.0, sequence, False)
         return (task.answer(done, 0.0, judged=False) for done in global_search(task))
@@ -249,6 +247,7 @@ class Optimiser:
         self, x: ArrayLike, horizon: float, budget: Budget, resolution: float, sequence: int,
         warm: bool,
     ) -> Optimisation:  # fmt: skip
+        at_least("sequence of a proposal", sequence, 0)
         if self.freedom.schedule and self.counts_time and self.loop.ensemble is not None:
             raise InvalidInputError(
                 "schedule",
