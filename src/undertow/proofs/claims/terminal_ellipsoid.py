@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
-from typing import Self, cast
+from typing import Any, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,8 +27,8 @@ from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.claim import Claim
 from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.kernel import claims as kernel
-from undertow.proofs.kernel.graph import Span
-from undertow.proofs.kernel.model import System
+from undertow.proofs.kernel.graph import Graph, Span
+from undertow.proofs.kernel.model import Law, System
 from undertow.proofs.require import require, require_autonomous
 
 
@@ -138,9 +138,14 @@ class ClosedLoopProgram:
 
     def __init__(self, mechanism: Mechanism, switching: str = "saturation") -> None:
         model = model_of(mechanism)
+        self.n, self.m = n, m = model.n, model.m
         bounds = tuple(Fraction(float(v)) for v in mechanism.disturbance_bounds)
-        own = System(model, None, switching, bounds)
-        self.n, self.m = model.n, model.m
+        fixed, layout = 2 * n + len(model.parameters), LawLayout(n, m)
+        graph = Graph(fixed + layout.reaching.stop)
+        numbers = graph.inputs[fixed:]
+        parts = *layout.blocks(numbers), numbers[layout.eta], numbers[layout.layer]
+        law = Law(*cast(Any, (*parts, switching, bounds)))
+        own = System(model, law, graph=graph, leaves=graph.inputs[:fixed])
         self.program = kernel.ellipsoid_program(own)
         self.own = own
 

@@ -17,17 +17,19 @@ import numpy as np
 
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.bound import Goal, settle
-from undertow.proofs.kernel.graph import FloatArray, Graph, Program, Span, hull
+from undertow.proofs.kernel.graph import Array, FloatArray, Graph, Node, Program, Span, hull
 from undertow.proofs.kernel.loop import ContinuousLoop, HeldLoop, Loop
 from undertow.proofs.kernel.model import (
-    Algebra,
     Law,
     Matrix,
     Model,
     Quantity,
     Sliding,
     System,
+    characteristic,
+    identity,
     input_limits,
+    solve,
     system,
 )
 from undertow.proofs.kernel.reader import (
@@ -100,22 +102,6 @@ def _texts(values: Any) -> Any:
 
 # -- linear algebra on exact numbers --------------------------------------------------------------
 
-Spans = list[list[Span]]
-
-
-def _characteristic(A: Spans) -> list[Span]:
-    """Coefficients of det(x − A), highest power first (Faddeev and LeVerrier)."""
-    n, out = len(A), [Span(1)]
-    N = [[Span(int(i == j)) for j in range(n)] for i in range(n)]
-    for k in range(1, n + 1):
-        step = [[sum((a * r[j] for a, r in zip(row, N, strict=True)), Span(0)) for j in range(n)]
-                for row in A]  # fmt: skip
-        trace = sum((step[i][i] for i in range(n)), Span(0))
-        out.append(trace * Span(Fraction(-1, k)))
-        N = [[v + out[-1] if i == j else v for j, v in enumerate(row)]
-             for i, row in enumerate(step)]  # fmt: skip
-    return out
-
 
 def _routh(coefficients: list[Span]) -> bool | None:
     """Lemma 3: whether a polynomial, its first coefficient > 0, is Hurwitz, if it is known."""
@@ -175,27 +161,23 @@ class Stability(Claim):
         matrix = _sliding_matrix(model, law)
         if isinstance(matrix, tuple):
             return *matrix, {}, {}
-        rate = Span(self.rate)
-        shifted = [[v + rate if i == j else v for j, v in enumerate(row)]
-                   for i, row in enumerate(matrix)]  # fmt: skip
-        exact = all(v.exact for row in matrix for v in row)
+        exact = all(v.exact for v in matrix.flat)
         method = f"Routh array in {'exact rationals' if exact else 'rational intervals'}"
-        stable = _routh(_characteristic(shifted))
+        diagonal = np.diag_indices(len(matrix))
+        matrix[diagonal] = matrix[diagonal] + Span(self.rate)
+        stable = _routh(characteristic(matrix, Span)[0])
         return {True: "proved", False: "refuted", None: "undecided"}[stable], method, {}, {}
 
 
-def _sliding_matrix(model: Model, law: Law) -> Spans | tuple[str, str]:
+def _sliding_matrix(model: Model, law: Law) -> Array | tuple[str, str]:
     """Return A of ż = A z, z = (q_a, q_u, v_u), or a verdict and why there is none."""
     n, m, size = model.n, model.m, 2 * model.n - model.m
     graph = Graph(size)
-    algebra, z = Algebra(graph), [[k] for k in graph.inputs]
-    blocks = ((law.lambda_a, z[:m]), (law.lambda_u, z[m:n]))
-    held, free = (
-        algebra.times([[graph.number(v) for v in row] for row in A], q) for A, q in blocks
-    )
+    q, v_u = np.split(graph.inputs, [n])
+    pull = graph.numbers(law.lambda_a) @ q[:m] + graph.numbers(law.lambda_u) @ q[m:]
     own = [graph.number(p.value or 0) for p in model.parameters]
-    on = Sliding.of(algebra, model, law, z[:n], algebra.each("add", held, free), z[n:], own)
-    rates, at = [row[0] for row in (*on.v_a, *z[n:], *on.v_u_dot)], [Span(0)] * size
+    on = Sliding.of(graph, model, law, q, pull, v_u, own)
+    rates, at = [*on.v_a, *v_u, *on.v_u_dot], [Span(0)] * size
     none = "det(M_uu − M_ua α_a⁻¹ α_u) = 0 at the target, or det α_a = 0: no sliding dynamics"
     try:
         if not all(v.low > 0 for v in graph.exact(on.pivots, at)):
@@ -212,7 +194,7 @@ def _sliding_matrix(model: Model, law: Law) -> Spans | tuple[str, str]:
         return "undecided", f"at the target: {error}"
     if not all(v.zero for v in values):
         return "undecided", "f_u(0, 0) = 0 is not shown exactly"
-    return [list(row) for row in zip(*slopes, strict=True)]
+    return np.array(slopes, dtype=object).T
 
 
 # -- 5.2, 5.3 -------------------------------------------------------------------------------------
@@ -243,7 +225,7 @@ def _sign(value: Span) -> int:
     return 1 if value.low > 0 else -1 if value.high < 0 else 0
 
 
-def _regular(own: System) -> tuple[list[int], list[Goal], Span] | str:
+def _regular(own: System) -> tuple[list[Node], list[Goal], Span] | str:
     """Nodes and goals of regularity, and det Γ(0); or why the target itself is not regular."""
     try:
         at = own.graph.exact([own.B_determinant, own.gamma_determinant], own.origin())
@@ -254,11 +236,11 @@ def _regular(own: System) -> tuple[list[int], list[Goal], Span] | str:
         return "det B or det Γ may be 0 at the target"
     goals = [Goal(f"pivot {k + 1} of M is > 0") for k in range(own.model.n)]
     goals += [Goal("det B keeps its sign", _sign(drive)), Goal("Γ is non-singular", _sign(gamma))]
-    return [*own.pivots, own.B_determinant, own.gamma_determinant], goals, gamma
+    return own.regular, goals, gamma
 
 
 def _over_region(
-    own: System, box: Region, nodes: Sequence[int], goals: Sequence[Goal], max_boxes: int
+    own: System, box: Region, nodes: Sequence[Node], goals: Sequence[Goal], max_boxes: int
 ) -> Found:
     n = own.model.n
     zero = (Fraction(0), Fraction(0))
@@ -364,18 +346,15 @@ class Reaching(Claim):
         if isinstance(regular, str):
             return "undecided", regular, {}, {}
         nodes, goals, _ = regular
-        graph, algebra, n, m = own.graph, own.algebra, model.n, model.m
-        one = [[graph.number(int(i == j)) for j in range(n)] for i in range(n)]
-        identity = [row[:m] for row in one[:m]]
-        actuated = algebra.times(own.gamma, algebra.solve(own.ss, identity))
-        rest = algebra.each("sub", own.alpha_u, algebra.times(actuated, own.M_au))
-        free = algebra.times(rest, algebra.solve(own.uu, [row[m:] for row in one[m:]]))
+        number, m = own.graph.number, model.m
+        actuated = own.gamma @ solve(own.ss, identity(m, number))
+        rest = own.alpha_u - actuated @ own.M_au
+        free = rest @ solve(own.uu, identity(model.n - m, number))
         for i in range(m):
-            left = graph.make("sub", own.gains[i], graph.number(self.rate[i]))
+            left = own.gains[i] - number(self.rate[i])
             for weight, bound in zip([*actuated[i], *free[i]], self.disturbance, strict=True):
-                load = graph.make("mul", graph.make("abs", weight), graph.number(bound))
-                left = graph.make("sub", left, load)
-            if (known := graph.value(left)) is not None:
+                left = left - abs(weight) * bound
+            if (known := left.number) is not None:
                 if known < 0:
                     return "refuted", f"k_{i + 1} − η̃_{i + 1} = {float(known):.4g} < 0", {}, {}
             else:

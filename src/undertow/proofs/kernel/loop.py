@@ -5,7 +5,7 @@ Coordinates and rates are those of Lemmas 8 and 10 of ``docs/certificate-format.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from undertow.proofs.kernel import compiled as ops
-from undertow.proofs.kernel.graph import FloatArray, Graph, Program, Span, hull
+from undertow.proofs.kernel.graph import Array, FloatArray, Graph, Program, Span, hull
 from undertow.proofs.kernel.model import Law, Matrix, Model, System, input_limits, scale_of, system
 from undertow.proofs.kernel.tube import Field, Held, Sampled, Tube, expanded
 
@@ -98,12 +98,10 @@ class Loop:
         kept = (ends[..., 0] > 0.0) | (ends[..., 1] < 0.0)
         return bool(kept.all() and (ends[:, :-2, 0] > 0.0).all())
 
-    def aim(self, graph: Graph, x: Sequence[int], W: Matrix, radius: Fraction) -> None:
+    def aim(self, graph: Graph, x: Array, W: Matrix, radius: Fraction) -> None:
         """Take {|W x| ≤ radius} as the set."""
         self.W, self.radius = np.array([[hull(v, v) for v in r] for r in W]), hull(radius, radius)
-        make, number = graph.make, graph.number
-        parts = [[make("mul", number(w), k) for w, k in zip(row, x, strict=True)] for row in W]
-        self.rows = graph.program([graph.sum(row) for row in parts])
+        self.rows = graph.program(graph.numbers(W) @ x)
 
     def follow(self, box: FloatArray, most: int = MOST_OF_ONE) -> tuple[int, bool]:
         """Return how many steps a tube from a box of starts (N, 2) takes, and whether it ends."""

@@ -10,14 +10,22 @@ found, the step.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
 
 from undertow.proofs.kernel import compiled as ops
-from undertow.proofs.kernel.graph import NOWHERE, FloatArray, Graph, Program
+from undertow.proofs.kernel.graph import (
+    NOWHERE,
+    FloatArray,
+    Graph,
+    Node,
+    Program,
+    Sides,
+    corners,
+)
 
 Pair = tuple[FloatArray, FloatArray]
 
@@ -37,22 +45,19 @@ class Field:
     A max or min of it has two sides; where both are possible it stays in the piece.
     """
 
-    def __init__(self, graph: Graph, rates: Sequence[int]) -> None:
+    def __init__(self, graph: Graph, rates: Sequence[Node]) -> None:
         self._graph, self._rates, self._pieces = graph, rates, dict[bytes, Program]()
-        self._corners = graph.corners(rates)
+        self._corners = corners(rates)
         self.whole = graph.program(rates)
-        self.gaps = graph.program([graph.make("sub", *graph.nodes[k][1:]) for k in self._corners])
+        self.gaps = graph.program([k.of[0] - k.of[1] for k in self._corners])
 
     def piece(self, gaps: FloatArray) -> tuple[Program, bool]:
         """Return the rates where the gaps of corners lie in (K, 2), and whether all are decided."""
         first, second = gaps[:, 0] >= 0.0, gaps[:, 1] <= 0.0
         key = first.tobytes() + second.tobytes()
         if key not in self._pieces:
-            sides = dict[int, int]()
-            for k, a, b in zip(self._corners, first, second, strict=True):
-                kind, x, y = self._graph.nodes[k]
-                if a or b:
-                    sides[k] = x if a == (kind == "max") else y
+            ends = zip(self._corners, first, second, strict=True)
+            sides = {k: k.of[int(a != (k.kind == "max"))] for k, a, b in ends if a or b}
             self._pieces[key] = self._graph.program(self._rates, sides)
         return self._pieces[key], bool((first | second).all())
 
@@ -138,18 +143,18 @@ class Held:
         Nodes of F (N), by x and u, and of the law (m), by x.
     """
 
-    def __init__(self, graph: Graph, rates: Sequence[int], law: Sequence[int]) -> None:
+    def __init__(self, graph: Graph, rates: Sequence[Node], law: Sequence[Node]) -> None:
         self.N, self.m = N, m = len(rates), len(law)
         self.graph, self.law, of = graph, law, [*graph.inputs[:N], *graph.inputs[-m:]]
-        by = np.array(graph.inputs[N:-m]).reshape(N + m, N).T.tolist()
+        by = graph.inputs[N:-m].reshape(N + m, N).T
         columns = [graph.tangents(rates, dict(zip(of, column, strict=True))) for column in by]
         self.both = graph.program([*rates, *(c[i] for i in range(N) for c in columns)])
         self.flow, self.renewed = graph.program(rates), graph.program(law)
         self.start = ops.points(np.eye(N)).reshape(-1, 2)
-        self._corners, self._pieces = graph.corners(law), dict[tuple[int, ...], Program]()
-        self.gaps = graph.program([graph.make("sub", *graph.nodes[k][1:]) for k in self._corners])
+        self._corners, self._pieces = corners(law), dict[tuple[int, ...], Program]()
+        self.gaps = graph.program([k.of[0] - k.of[1] for k in self._corners])
 
-    def by_states(self, nodes: Sequence[int], sides: Mapping[int, int] = NOWHERE) -> Program:
+    def by_states(self, nodes: Collection[Node], sides: Sides = NOWHERE) -> Program:
         """Return nodes, and their derivatives by x, row by row."""
         one, graph = self.graph.number(1), self.graph
         slopes = [graph.tangents(nodes, {x: one}, sides) for x in graph.inputs[: self.N]]
@@ -170,12 +175,11 @@ class Held:
         none, options, slopes = self.fixed(), list[list[int]](), list[FloatArray]()
         gaps = ops.along(*expanded(self.gaps, tube.hull, tube.m, none), *tube.parts)
         for (low, high), k in zip(gaps, self._corners, strict=True):
-            larger = 2 if self.graph.nodes[k][0] == "max" else 1  # where the gap is below 0
-            options.append([larger] if high <= 0.0 else [3 - larger] if low >= 0.0 else [1, 2])
+            larger = int(k.kind == "max")  # where the gap is below 0
+            options.append([larger] if high <= 0.0 else [1 - larger] if low >= 0.0 else [0, 1])
         for piece in itertools.product(*options):
             if piece not in self._pieces:
-                pairs = zip(self._corners, piece, strict=True)
-                sides = {k: self.graph.nodes[k][i] for k, i in pairs}
+                sides = {k: k.of[i] for k, i in zip(self._corners, piece, strict=True)}
                 self._pieces[piece] = self.by_states(self.law, sides)
             own, at = expanded(self._pieces[piece], tube.hull, tube.m, none)
             slopes.append(ops.along(own, at, *tube.parts)[self.m :])
