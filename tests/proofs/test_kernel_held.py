@@ -20,6 +20,8 @@ from undertow.base import InvalidInputError
 from undertow.law import ReachingLaw, SlidingModeLaw
 from undertow.models import FloatArray
 from undertow.proofs.claims.model_data import law_of, model_of
+from undertow.proofs.claims.words import sentence
+from undertow.proofs.claims.written import claim_data
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.claims import ClosedLoop, TerminalEllipsoid, decide, read_claim
 from undertow.proofs.kernel.graph import Graph, Program
@@ -335,13 +337,14 @@ def test_a_line_of_starts_converges_at_1_khz_and_the_sentence_says_so() -> None:
         "its input clipped to |voltage| ≤ 15.0 V and held for 0.001 s",
         "the plant the model, no other force",
     ):
-        assert words in found.sentence
+        assert words in sentence(claim(phi=0.01), MODEL)
 
 
 def test_every_plant_of_a_box_converges_and_the_sentence_names_it() -> None:
-    found = decide(MODEL, NUMBERS, claim(plant=within("1/100", "m"), phi=0.002))
+    own = claim(plant=within("1/100", "m"), phi=0.002)
+    found = decide(MODEL, NUMBERS, own)
     assert found.kind == "proved", found.why
-    assert "the plant any with m in [0.12375, 0.12625]" in found.sentence
+    assert "the plant any with m in [0.12375, 0.12625]" in sentence(own, MODEL)
     assert found.details["tubes"] >= 1
 
 
@@ -371,7 +374,7 @@ def test_what_is_false_or_not_shown_is_not_proved() -> None:
 
 def test_cuts_may_be_of_the_plant_too() -> None:
     own = replace(claim(plant=within("1/100", "m"), phi=0.002), cuts={"m": (Fraction(1, 8),)})
-    data = {"kind": own.kind, **own.data()}
+    data = claim_data(own)
     assert read_claim(data, MODEL) == own
     assert decide(MODEL, NUMBERS, own).details["tubes"] == 2
     with pytest.raises(Refused, match="what varies"):

@@ -20,6 +20,8 @@ from undertow.proofs.claims.closed_loop import LoopClaim
 from undertow.proofs.claims.document import document_bytes
 from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.claims.verify import proved_sets, verify
+from undertow.proofs.claims.words import sentence
+from undertow.proofs.claims.written import claim_data
 from undertow.proofs.kernel.claims import (
     STEP,
     ClosedLoop,
@@ -160,7 +162,7 @@ def test_a_line_of_starts_converges_and_the_sentence_says_what() -> None:
         "its input clipped to |voltage| ≤ 15.0 V and renewed at every instant",
         "the plant the model, no other force",
     ):
-        assert words in found.sentence
+        assert words in sentence(claim(phi=0.01), MODEL)
 
 
 def test_cuts_say_where_tubes_begin_and_decide_nothing() -> None:
@@ -169,7 +171,7 @@ def test_cuts_say_where_tubes_begin_and_decide_nothing() -> None:
     cut = replace(whole, cuts={"phi": tuple(Fraction(k, 1000) for k in (7, 3, 3, -5, 20))})
     one, three = decide(MODEL, NUMBERS, whole), decide(MODEL, NUMBERS, cut)
     assert one.kind == three.kind == "proved"
-    assert one.sentence == three.sentence
+    assert sentence(whole, MODEL) == sentence(cut, MODEL)
     assert three.details["tubes"] == 3 > one.details["tubes"]
     far = replace(cut, starts={"phi": (Fraction(-4, 5), Fraction(4, 5))})
     assert decide(MODEL, NUMBERS, far).kind == "undecided"  # 45.8° falls
@@ -306,7 +308,7 @@ def test_what_is_false_or_not_decided_is_not_proved() -> None:
 
 def test_a_claim_is_written_and_read_again() -> None:
     own = replace(claim(phi=0.01, phi_dot=0.02), cuts={"phi": (Fraction(1, 200),)})
-    data = {"kind": own.kind, **own.data()}
+    data = claim_data(own)
     assert read_claim(data, MODEL) == own
     for key, value in (
         ("starts", {"psi": ["0", "1"]}),

@@ -18,15 +18,16 @@ import sympy as sp
 import undertow as ut
 from undertow.base import ModelError
 from undertow.base.errors import CertificateError
+from undertow.proofs.claims import words
 from undertow.proofs.claims.certificate import Certificate
 from undertow.proofs.claims.document import document_bytes
 from undertow.proofs.claims.model_data import law_of, model_data, model_of
 from undertow.proofs.claims.verify import verify
+from undertow.proofs.claims.written import number_text
 from undertow.proofs.kernel import claims as kernel
-from undertow.proofs.kernel import words
 from undertow.proofs.kernel.claims import Nonsingular, Reaching, Stability, check, decide
 from undertow.proofs.kernel.model import Law, Model, Quantity
-from undertow.proofs.kernel.reader import Refused, digest, number, number_text, read, read_model
+from undertow.proofs.kernel.reader import Refused, digest, number, read, read_model
 
 ROOT = Path(__file__).parents[2]
 WRITTEN = (ROOT / "tests/data/certificate_v2.json").read_bytes()
@@ -339,11 +340,10 @@ def test_a_file_has_no_sentence_to_believe() -> None:
         claim_of(document, "stability")["rate"] = "1/2"
 
     found = check(read(edited(boast)))
-    assert all("every start" not in d.sentence for _, _, d in found)
-    assert (
-        "at a rate of at least 0.5 1/s"
-        in next(d for _, c, d in found if c.kind == "stability").sentence
-    )
+    model = read(edited(boast)).model
+    said = {c.kind: words.sentence(c, model) for _, c, _ in found}
+    assert all("every start" not in text for text in said.values())
+    assert "at a rate of at least 0.5 1/s" in said["stability"]
     with pytest.raises(Refused, match="text"):
         check(read(edited(lambda d: claim_of(d, "stability").update(text="every start converges"))))
 
@@ -352,14 +352,14 @@ def test_reaching_ends_at_the_singularity_and_names_its_region() -> None:
     model, law = model_of(RIG), law_of(RIG, SURFACE, LAW)
     load = (Fraction(1, 1000), Fraction(0))
 
-    def over(end: float) -> kernel.Decision:
-        region = {"phi": (Fraction(-end), Fraction(end))}
-        return decide(model, law, Reaching(region, load, (Fraction(1),)))
+    def over(end: float) -> Reaching:
+        return Reaching({"phi": (Fraction(-end), Fraction(end))}, load, (Fraction(1),))
 
-    assert over(0.9).kind == "proved"
-    assert "|phi| ≤ 0.9 rad" in over(0.9).sentence
-    assert over(1.1).kind == "refuted"
-    assert "non-singular" in over(1.1).why
+    assert decide(model, law, over(0.9)).kind == "proved"
+    assert "|phi| ≤ 0.9 rad" in words.sentence(over(0.9), model)
+    far = decide(model, law, over(1.1))
+    assert far.kind == "refuted"
+    assert "non-singular" in far.why
     tanh = law_of(RIG, SURFACE, ut.ReachingLaw(switching="tanh"))
     region = {"phi": (Fraction(0), Fraction(0))}
     assert decide(model, tanh, Reaching(region, load, (Fraction(0),))).kind == "undecided"

@@ -17,6 +17,8 @@ from undertow.base import InvalidInputError, UnstableSurfaceError
 from undertow.law import SlidingModeLaw, sliding_matrix
 from undertow.models import TIME
 from undertow.proofs.claims.region import reaches, verify_region
+from undertow.proofs.claims.words import sentence
+from undertow.proofs.claims.written import claim_data
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.claims import SurfaceRegion, decide, read_claim
 from undertow.proofs.kernel.graph import Graph
@@ -438,10 +440,10 @@ def test_what_is_undefined_on_a_box_has_no_model() -> None:
 def test_a_file_says_all_and_false_claims_are_not_proved() -> None:
     """Two kept functions, as a file has them; then larger, steeper, shifted or elsewhere."""
     model, law, claim = first_two(4)
-    assert read_claim({"kind": claim.kind, **claim.data()}, model) == claim
+    assert read_claim(claim_data(claim), model) == claim
     proved = decide(model, law, claim, 20_000)
     assert proved.kind == "proved"
-    assert "inputs not limited" in proved.sentence
+    assert "inputs not limited" in sentence(claim, model)
     first, second = claim.functions
     far = replace(claim, contains=(claim.contains[0] * 55, *claim.contains[1:]))
     assert decide(model, law, far, 20_000).kind == "refuted"
@@ -459,9 +461,9 @@ def test_a_file_says_all_and_false_claims_are_not_proved() -> None:
     assert "refuted" in kinds
     unstable = replace(law, lambda_u=tuple(tuple(-v for v in row) for row in law.lambda_u))
     assert decide(model, unstable, claim, 1000).kind != "proved"
-    full = claim.data()["functions"][0] | {"G": [["1"] * 3] * 3}
+    full = claim_data(claim)["functions"][0] | {"G": [["1"] * 3] * 3}
     with pytest.raises(Refused, match="lower triangular"):
-        read_claim({"kind": claim.kind, **claim.data(), "functions": [full]}, model)
+        read_claim({**claim_data(claim), "functions": [full]}, model)
 
 
 @pytest.mark.slow

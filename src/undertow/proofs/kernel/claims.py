@@ -1,4 +1,4 @@
-"""The rules: each kind of claim with its statement, its decision and its sentence.
+"""The rules: each kind of claim with its statement and its decision.
 
 Statements and lemmas are those of ``docs/certificate-format.md``, section 5, under the same names.
 """
@@ -23,7 +23,6 @@ from undertow.proofs.kernel.model import (
     Law,
     Matrix,
     Model,
-    Quantity,
     Sliding,
     System,
     characteristic,
@@ -38,16 +37,16 @@ from undertow.proofs.kernel.reader import (
     interval,
     matrix,
     number,
-    number_text,
     numbers,
     require,
 )
 from undertow.proofs.kernel.region import Function, Stage, Stretch, on_the_line
-from undertow.proofs.kernel.words import Region, inward, limits, region, within
 
 __all__ = ["KINDS", "Claim", "ClosedLoop", "Decision", "Nonsingular", "Reaching", "Stability",
            "SurfaceRegion", "TerminalEllipsoid", "check", "decide", "ellipsoid",
            "ellipsoid_program", "no_equilibrium", "read_claim"]  # fmt: skip
+
+Region = Mapping[str, tuple[Fraction, Fraction]]
 
 #: Boxes of a branch and bound before it gives up.
 MOST_BOXES = 200_000
@@ -57,12 +56,10 @@ MOST_BOXES = 200_000
 class Decision:
     """What the checker says of one claim: ``proved``, ``refuted`` or ``undecided``, and why.
 
-    ``sentence`` is the statement, in words made of the claim's numbers; ``witness`` the point
-    where a refuted claim is false, or where the checker gave up.
+    ``witness`` is the point where a refuted claim is false, or where the checker gave up.
     """
 
     kind: str
-    sentence: str
     why: str
     witness: Mapping[str, float] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)
@@ -84,20 +81,8 @@ class Claim(ABC):
         """Read it from an object with its keys."""
 
     @abstractmethod
-    def data(self) -> dict[str, Any]:
-        """Return the object that :meth:`read` reads."""
-
-    @abstractmethod
-    def sentence(self, model: Model) -> str:
-        """Return the statement in words."""
-
-    @abstractmethod
     def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
         """Decide the statement."""
-
-
-def _texts(values: Any) -> Any:
-    return [_texts(v) for v in values] if isinstance(values, tuple) else number_text(values)
 
 
 # -- linear algebra on exact numbers --------------------------------------------------------------
@@ -113,17 +98,6 @@ def _routh(coefficients: list[Span]) -> bool | None:
         padded = second + [Span(0)] * (len(first) - len(second))
         third = [first[i + 1] - factor * padded[i + 1] for i in range(len(first) - 1)]
         first, second = second, third
-    return True
-
-
-def _positive(A: list[list[Fraction]]) -> bool:
-    """Whether a symmetric rational matrix is positive definite, by its pivots."""
-    for j, row in enumerate(A):
-        if row[j] <= 0:
-            return False
-        for i in range(j + 1, len(A)):
-            factor = A[i][j] / row[j]
-            A[i] = [a - factor * b for a, b in zip(A[i], row, strict=True)]
     return True
 
 
@@ -144,17 +118,6 @@ class Stability(Claim):
         rate = number(data["rate"])
         require(rate >= 0, "a rate ≥ 0")
         return cls(rate)
-
-    def data(self) -> dict[str, Any]:
-        """Return the object that :meth:`read` reads."""
-        return {"rate": number_text(self.rate)}
-
-    def sentence(self, model: Model) -> str:
-        """Return the statement in words."""
-        return (
-            "motions on the surface near the target converge to it exponentially, at a rate of at "
-            f"least {inward(self.rate)} 1/s; how near is not said, and the input is not limited"
-        )
 
     def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
         """Decide the statement."""
@@ -217,10 +180,6 @@ def _read_region(data: Any, model: Model) -> dict[str, Any]:
     return _read_box(data, {p.name: Fraction(0) for p in model.positions})
 
 
-def _box_data(box: Region) -> dict[str, Any]:
-    return {k: [number_text(v) for v in ends] for k, ends in box.items()}
-
-
 def _sign(value: Span) -> int:
     return 1 if value.low > 0 else -1 if value.high < 0 else 0
 
@@ -272,18 +231,6 @@ class Nonsingular(Claim):
         require(ratio > 0, "a ratio > 0")
         return cls(_read_region(data["region"], model), ratio)
 
-    def data(self) -> dict[str, Any]:
-        """Return the object that :meth:`read` reads."""
-        return {"region": _box_data(self.region), "ratio": number_text(self.ratio)}
-
-    def sentence(self, model: Model) -> str:
-        """Return the statement in words."""
-        where = region(model.positions, self.region)
-        return (
-            f"the law exists {where}: M is positive definite, B and α_a − α_u M_uu⁻¹ M_auᵀ are "
-            f"non-singular, whose determinant keeps {inward(self.ratio)} of that at the target"
-        )
-
     def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
         """Decide the statement."""
         own = system(model, law)
@@ -314,28 +261,6 @@ class Reaching(Claim):
         bounds, rate = numbers(data["disturbance"], model.n), numbers(data["rate"], model.m)
         require(min(*bounds, *rate) >= 0, "disturbances and rates ≥ 0")
         return cls(_read_region(data["region"], model), bounds, rate)
-
-    def data(self) -> dict[str, Any]:
-        """Return the object that :meth:`read` reads."""
-        numbers = {"disturbance": _texts(self.disturbance), "rate": _texts(self.rate)}
-        return {"region": _box_data(self.region), **numbers}
-
-    def sentence(self, model: Model) -> str:
-        """Return the statement in words."""
-        loads = ", ".join(
-            f"{p.name}: {inward(v)} {'N m' if p.unit == 'rad' else 'N'}"
-            for p, v in zip(model.positions, self.disturbance, strict=True)
-            if v
-        )
-        what = (
-            f"overcomes every disturbance on {loads} at most," if loads else "reaches the surface"
-        )
-        rates = ", ".join(inward(v) for v in self.rate)
-        return (
-            f"the law {what} {region(model.positions, self.region)}: (16) with η = {rates}, "
-            "wherever |s_i| ≥ ε_i, the inputs not limited; motions that leave these positions are "
-            "not covered"
-        )
 
     def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
         """Decide the statement."""
@@ -417,35 +342,6 @@ class TerminalEllipsoid(Claim):
         require(radius > 0, "a radius > 0")
         return cls(matrix(data["W"], 2 * model.n, 2 * model.n), radius)
 
-    def data(self) -> dict[str, Any]:
-        """Return the object that :meth:`read` reads."""
-        return {"W": _texts(self.W), "radius": number_text(self.radius)}
-
-    @property
-    def ball(self) -> float:
-        """A radius of a ball ‖x‖ ≤ r inside: ρ/c where c² − WᵀW is shown positive definite."""
-        size = float(np.linalg.norm(np.array(self.W, dtype=float), 2))
-        for slack in (1e-12, 1e-6, 1.0):
-            c = Fraction(size * (1 + slack))
-            columns = list(zip(*self.W, strict=True))
-            rest = [
-                [c * c * int(i == j) - sum(a * b for a, b in zip(p, q, strict=True))
-                 for j, q in enumerate(columns)]
-                for i, p in enumerate(columns)
-            ]  # fmt: skip
-            if _positive(rest):
-                return float(self.radius / c) * (1 - 1e-15)
-        return 0.0
-
-    def sentence(self, model: Model) -> str:
-        """Return the statement in words."""
-        ball = inward(Fraction(self.ball), 3)
-        return (
-            "every motion of the full closed loop, its input renewed at every instant and the "
-            f"plant the model, from {{|W x| ≤ ρ}}, which holds the ball ‖x‖ ≤ {ball}, "
-            f"stays there and converges, inside the layer and {limits(model)}"
-        )
-
     def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
         """Decide the statement."""
         if law.switching == "sign":
@@ -458,7 +354,7 @@ class TerminalEllipsoid(Claim):
             ellipsoid_program(own), own.fixed(), W, hull(self.radius, self.radius)[1],
             _rows(law), np.array([hull(v, v)[0] for v in law.layer]), input_limits(model),
         )  # fmt: skip
-        details = {"margin": float(margin), "box": half.tolist(), "ball": self.ball}
+        details = {"margin": float(margin), "box": half.tolist()}
         witness = dict(zip(model.states, half.tolist(), strict=True))
         method = "interval Jacobian over the ellipsoid's box, diagonal dominance"
         if code == 0:
@@ -537,36 +433,10 @@ class SurfaceRegion(Claim):
         functions = tuple(_function(v, size) for v in listed)
         return cls(stretch, functions, contains, _read_plant(data["plant"], model))
 
-    def data(self) -> dict[str, Any]:
-        """Return the object that :meth:`read` reads."""
-        functions = [
-            {"A": _texts(V.A), "G": _texts(V.G), "exponents": [list(e) for e in V.exponents],
-             "coefficients": _texts(V.coefficients)}
-            for V in self.functions
-        ]  # fmt: skip
-        pole = None if self.stretch.L is None else number_text(self.stretch.L)
-        return {
-            "stretch": _texts(self.stretch.S), "pole": pole, "functions": functions,
-            "contains": _texts(self.contains), "plant": _box_data(self.plant),
-        }  # fmt: skip
-
-    def sentence(self, model: Model) -> str:
-        """Return the statement in words; with one entry the point may be rounded towards 0."""
-        names = _surface_names(model)
-        away = {k: v for k, v in zip(names, self.contains, strict=True) if v}
-        exact = len(away) > 1
-        points = [f"{k} = {float(v)!r}" if exact else f"{k} = {inward(v)}" for k, v in away.items()]
-        ranges = "".join(f", for every {k} in {within(*ends)}" for k, ends in self.plant.items())
-        return (
-            "every motion on the surface from a compact set around the target that contains "
-            f"{', '.join(points) or 'it'} converges to the target{ranges}, non-singular all the "
-            f"way, in the union of {len(self.functions)} such sets; the inputs not limited"
-        )
-
     def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
         """Decide the statement."""
         names = (
-            *_surface_names(model),
+            *surface_names(model),
             *(p.name for p in model.parameters if p.name in self.plant),
         )
         if len(names) > 8:
@@ -587,7 +457,7 @@ class SurfaceRegion(Claim):
         return line.kind, why, witness, {"boxes": boxes + line.boxes}
 
 
-def _surface_names(model: Model) -> tuple[str, ...]:
+def surface_names(model: Model) -> tuple[str, ...]:
     """Names of y = (q_u, v_u, w)."""
     names, m = [p.name for p in model.positions], model.m
     return (*names[m:], *(f"{k}_dot" for k in names[m:]), *(f"w_{k}" for k in names[:m]))
@@ -633,39 +503,13 @@ class ClosedLoop(Claim):
         require(all(isinstance(v, list) for v in cuts.values()), "boxes: lists")
         cuts = {name: numbers(v, len(v)) for name, v in cuts.items()}
         require(math.prod(1 + len(v) for v in cuts.values()) <= 20_000, "at most 20000 boxes")
-        step = number(hint.get("step", number_text(STEP)))
+        step = number(hint["step"]) if "step" in hint else STEP
         require(0 < step <= 1, "a step of 0 to 1 s")
         terminal = hint.get("terminal")
         if terminal is not None:
             fields(terminal, "terminal", TerminalEllipsoid.keys)
             terminal = TerminalEllipsoid.read(terminal, model)
         return cls(box, period, plant, bounds, ball, terminal, cuts, step)
-
-    def data(self) -> dict[str, Any]:
-        """Return the object that :meth:`read` reads."""
-        hint = {"step": number_text(self.step)}
-        known = {} if self.terminal is None else {"terminal": self.terminal.data()}
-        known |= {"boxes": {k: _texts(v) for k, v in self.cuts.items()}} if self.cuts else {}
-        return {
-            "starts": _box_data(self.starts), "period": number_text(self.period),
-            "plant": _box_data(self.plant), "disturbance": _texts(self.disturbance),
-            "ball": number_text(self.ball), "hint": {**hint, **known},
-        }  # fmt: skip
-
-    def sentence(self, model: Model) -> str:
-        """Return the statement in words."""
-        rates = [Quantity(f"{p.name}_dot", f"{p.unit}/s") for p in model.positions]
-        starts = region([*model.positions, *rates], self.starts).replace("for ", "with ", 1)
-        end = f"‖x‖ ≤ {inward(self.ball)}" if self.ball else "the target"
-        held = f"held for {float(self.period)!r} s" if self.period else "renewed at every instant"
-        varied = ", ".join(f"{k} in {within(*ends)}" for k, ends in self.plant.items())
-        plant = f"any with {varied}" if varied else "the model"
-        loads = ", ".join(inward(v) for v in self.disturbance)
-        return (
-            f"every motion from starts {starts}, exists for ever and converges to {end}, the law "
-            f"with its layer, its input clipped to {limits(model)} and {held}, the plant {plant}, "
-            f"{f'forces up to {loads}' if any(self.disturbance) else 'no other force'}"
-        )
 
     def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
         """Decide the statement."""
@@ -738,8 +582,7 @@ def read_claim(data: Mapping[str, Any], model: Model) -> Claim:
 
 def decide(model: Model, law: Law, claim: Claim, max_boxes: int = MOST_BOXES) -> Decision:
     """Decide a claim about a model and a law."""
-    kind, why, witness, details = claim.decide(model, law, max_boxes)
-    return Decision(kind, claim.sentence(model), why, witness, details)
+    return Decision(*claim.decide(model, law, max_boxes))
 
 
 def check(

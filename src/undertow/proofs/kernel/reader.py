@@ -13,7 +13,7 @@ from typing import Any
 from undertow.proofs.kernel.model import Law, Matrix, Model, Quantity
 
 __all__ = ["Document", "Refused", "Subject", "canonical", "digest", "interval", "matrix", "number",
-           "number_text", "numbers", "read", "read_law", "read_model"]  # fmt: skip
+           "numbers", "read", "read_law", "read_model"]  # fmt: skip
 
 FORMAT, VERSION = "undertow-certificate", 2
 
@@ -64,16 +64,6 @@ def number(text: Any) -> Fraction:
     above, _, below = text.partition("/")
     require(not below or int(below) > 0, f"number {text[:40]!r}: a divisor of 0")
     return Fraction(int(above), int(below or 1))
-
-
-def number_text(value: Fraction | float) -> str:
-    """Return the number text of a double, or of a rational number: what :func:`number` reads."""
-    exact = Fraction(value)
-    try:
-        near = exact.numerator / exact.denominator
-    except OverflowError:
-        return str(exact)
-    return near.hex() if exact.denominator > 1 and Fraction(near) == exact else str(exact)
 
 
 def numbers(data: Any, count: int) -> tuple[Fraction, ...]:

@@ -196,7 +196,7 @@ def prove_loop(
             limit=f"boxes down to {THINNEST:.2g} of what was asked for",
             remedy="Give smaller starts, or more time",
         )
-    found = LoopClaim(task.claim(known, part, cuts).data())
+    found = LoopClaim.of(task.claim(known, part, cuts))
     verdict = found.decide(mechanism, surface, law)
     return ProvedLoop(found, verdict, time.process_time() - started)
 
