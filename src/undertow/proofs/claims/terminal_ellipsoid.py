@@ -27,7 +27,8 @@ from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.claim import Claim
 from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.kernel import claims as kernel
-from undertow.proofs.kernel.graph import Graph, Span
+from undertow.proofs.kernel.compiled import between
+from undertow.proofs.kernel.graph import Graph, Intervals, Span
 from undertow.proofs.kernel.model import Law, System
 from undertow.proofs.require import require, require_autonomous
 
@@ -188,14 +189,14 @@ class ClosedLoopProgram:
         ]
         return kernel.no_equilibrium(self.own, values) is None
 
-    def over(self, low: FloatArray, high: FloatArray, variables: int = 0) -> FloatArray:
-        """Enclose the outputs over a box of inputs, (O, 1 + variables, 2)."""
-        return self.program(low, high, variables)
+    def over(self, low: FloatArray, high: FloatArray, variables: int = 0) -> Intervals:
+        """Enclose the outputs over a box of inputs, (O, 1 + variables)."""
+        return self.program(between(low, high), variables)
 
-    def at_target(self, numbers: FloatArray) -> FloatArray:
-        """Return enclosures of the outputs and of their gradients at x = 0, (O, 1 + 2n, 2)."""
+    def at_target(self, numbers: FloatArray) -> Intervals:
+        """Return enclosures of the outputs and of their gradients at x = 0, (O, 1 + 2n)."""
         point = np.concatenate([np.zeros(2 * self.n), numbers])
-        return self.program(point, point, 2 * self.n)
+        return self.over(point, point, 2 * self.n)
 
 
 class _ByStructure:
@@ -224,15 +225,11 @@ def prove(
     rows: tuple[FloatArray, FloatArray],
     limits: FloatArray,
     found: TerminalEllipsoid,
-    centre: FloatArray | None = None,
+    centre: Intervals | None = None,
 ) -> tuple[int, float, FloatArray]:
     """Run the kernel's rule: the index of what is not shown, the margin, the box's half-sides."""
-
-    def points(values: FloatArray) -> FloatArray:
-        return np.stack([values, values], axis=-1)
-
-    C, layer = rows
+    (C, layer), W = rows, found.W
     return kernel.ellipsoid(
-        loop.program, points(numbers), points(found.W), found.radius, points(C), layer, limits,
-        centre,
+        loop.program, between(numbers, numbers), between(W, W), found.radius, between(C, C), layer,
+        limits, centre,
     )  # fmt: skip

@@ -17,7 +17,15 @@ import numpy as np
 
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.bound import Goal, settle
-from undertow.proofs.kernel.graph import Array, FloatArray, Graph, Node, Program, Span, hull
+from undertow.proofs.kernel.graph import (
+    Array,
+    FloatArray,
+    Graph,
+    Intervals,
+    Node,
+    Program,
+    Span,
+)
 from undertow.proofs.kernel.loop import ContinuousLoop, HeldLoop, Loop
 from undertow.proofs.kernel.model import (
     Law,
@@ -42,10 +50,6 @@ from undertow.proofs.kernel.reader import (
 )
 from undertow.proofs.kernel.region import Function, Stage, Stretch, on_the_line
 
-__all__ = ["KINDS", "Claim", "ClosedLoop", "Decision", "Nonsingular", "Reaching", "Stability",
-           "SurfaceRegion", "TerminalEllipsoid", "check", "decide", "ellipsoid",
-           "ellipsoid_program", "no_equilibrium", "read_claim"]  # fmt: skip
-
 Region = Mapping[str, tuple[Fraction, Fraction]]
 
 #: Boxes of a branch and bound before it gives up.
@@ -65,10 +69,6 @@ class Decision:
     details: Mapping[str, Any] = field(default_factory=dict)
 
 
-#: Kind of verdict, why, witness, details.
-Found = tuple[str, str, dict[str, float], dict[str, Any]]
-
-
 class Claim(ABC):
     """Numbers with a statement about a model and a law."""
 
@@ -81,7 +81,7 @@ class Claim(ABC):
         """Read it from an object with its keys."""
 
     @abstractmethod
-    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Decision:
         """Decide the statement."""
 
 
@@ -119,20 +119,20 @@ class Stability(Claim):
         require(rate >= 0, "a rate ≥ 0")
         return cls(rate)
 
-    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Decision:
         """Decide the statement."""
         matrix = _sliding_matrix(model, law)
-        if isinstance(matrix, tuple):
-            return *matrix, {}, {}
+        if isinstance(matrix, Decision):
+            return matrix
         exact = all(v.exact for v in matrix.flat)
         method = f"Routh array in {'exact rationals' if exact else 'rational intervals'}"
         diagonal = np.diag_indices(len(matrix))
         matrix[diagonal] = matrix[diagonal] + Span(self.rate)
         stable = _routh(characteristic(matrix, Span)[0])
-        return {True: "proved", False: "refuted", None: "undecided"}[stable], method, {}, {}
+        return Decision({True: "proved", False: "refuted", None: "undecided"}[stable], method)
 
 
-def _sliding_matrix(model: Model, law: Law) -> Array | tuple[str, str]:
+def _sliding_matrix(model: Model, law: Law) -> Array | Decision:
     """Return A of ż = A z, z = (q_a, q_u, v_u), or a verdict and why there is none."""
     n, m, size = model.n, model.m, 2 * model.n - model.m
     graph = Graph(size)
@@ -144,19 +144,19 @@ def _sliding_matrix(model: Model, law: Law) -> Array | tuple[str, str]:
     none = "det(M_uu − M_ua α_a⁻¹ α_u) = 0 at the target, or det α_a = 0: no sliding dynamics"
     try:
         if not all(v.low > 0 for v in graph.exact(on.pivots, at)):
-            return "undecided", "M is not shown to be positive definite at the target"
+            return Decision("undecided", "M is not shown to be positive definite at the target")
         for k in on.determinants:
             (value,) = graph.exact([k], at)
             if value.zero:
-                return "refuted", none
+                return Decision("refuted", none)
             if not _sign(value):
-                return "undecided", f"not excluded: {none}"
+                return Decision("undecided", f"not excluded: {none}")
         values, one = graph.exact(rates, at), graph.number(1)
         slopes = [graph.exact(graph.tangents(rates, {k: one}), at) for k in graph.inputs]
     except ArithmeticError as error:
-        return "undecided", f"at the target: {error}"
+        return Decision("undecided", f"at the target: {error}")
     if not all(v.zero for v in values):
-        return "undecided", "f_u(0, 0) = 0 is not shown exactly"
+        return Decision("undecided", "f_u(0, 0) = 0 is not shown exactly")
     return np.array(slopes, dtype=object).T
 
 
@@ -200,11 +200,11 @@ def _regular(own: System) -> tuple[list[Node], list[Goal], Span] | str:
 
 def _over_region(
     own: System, box: Region, nodes: Sequence[Node], goals: Sequence[Goal], max_boxes: int
-) -> Found:
+) -> Decision:
     n = own.model.n
     zero = (Fraction(0), Fraction(0))
     ends = [box.get(p.name, zero) for p in own.model.positions]
-    fixed = np.vstack([np.zeros((n, 2)), own.fixed()])
+    fixed = np.concatenate([np.zeros(n), own.fixed()])
     found = settle(own.graph.program(nodes), ends, fixed, goals, max_boxes)
     method = "intervals and mean values, branch and bound"
     why = method if found.kind == "proved" else f"{method}: {found.why}, not shown"
@@ -212,7 +212,7 @@ def _over_region(
     witness = dict(zip(names, found.point, strict=False))
     if found.kind == "refuted":
         why = f"{method}; false: {found.why}"
-    return found.kind, why, witness, {"boxes": found.boxes}
+    return Decision(found.kind, why, witness, {"boxes": found.boxes})
 
 
 @dataclass(frozen=True)
@@ -231,16 +231,16 @@ class Nonsingular(Claim):
         require(ratio > 0, "a ratio > 0")
         return cls(_read_region(data["region"], model), ratio)
 
-    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Decision:
         """Decide the statement."""
         own = system(model, law)
         regular = _regular(own)
         if isinstance(regular, str):
-            return "undecided", regular, {}, {}
+            return Decision("undecided", regular)
         nodes, goals, gamma = regular
         least = gamma * Span(_sign(gamma) * self.ratio)
         bound = Goal(
-            "det Γ/det Γ(0) is as stated", _sign(gamma), hull(least.low, least.high), False
+            "det Γ/det Γ(0) is as stated", _sign(gamma), ops.hull(least.low, least.high), False
         )
         return _over_region(own, self.region, [*nodes, nodes[-1]], [*goals, bound], max_boxes)
 
@@ -262,14 +262,14 @@ class Reaching(Claim):
         require(min(*bounds, *rate) >= 0, "disturbances and rates ≥ 0")
         return cls(_read_region(data["region"], model), bounds, rate)
 
-    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Decision:
         """Decide the statement."""
         if law.switching == "tanh":
-            return "undecided", "tanh is less than 1 everywhere: (16) is not stated of it", {}, {}
+            return Decision("undecided", "tanh is less than 1 everywhere: (16) is not stated of it")
         own = system(model, law)
         regular = _regular(own)
         if isinstance(regular, str):
-            return "undecided", regular, {}, {}
+            return Decision("undecided", regular)
         nodes, goals, _ = regular
         number, m = own.graph.number, model.m
         actuated = own.gamma @ solve(own.ss, identity(m, number))
@@ -281,7 +281,7 @@ class Reaching(Claim):
                 left = left - abs(weight) * bound
             if (known := left.number) is not None:
                 if known < 0:
-                    return "refuted", f"k_{i + 1} − η̃_{i + 1} = {float(known):.4g} < 0", {}, {}
+                    return Decision("refuted", f"k_{i + 1} − η̃_{i + 1} = {float(known):.4g} < 0")
             else:
                 nodes = [*nodes, left]
                 goals = [*goals, Goal(f"row {i + 1} of (16)", strict=False)]
@@ -298,8 +298,8 @@ REASONS = (
 
 
 def ellipsoid(
-    program: Program, fixed: FloatArray, W: FloatArray, radius: float, C: FloatArray,
-    layer: FloatArray, limits: FloatArray, centre: FloatArray | None = None,
+    program: Program, fixed: Intervals, W: Intervals, radius: float, C: Intervals,
+    layer: FloatArray, limits: FloatArray, centre: Intervals | None = None,
 ) -> tuple[int, float, FloatArray]:  # fmt: skip
     """Decide Lemma 5, as ``compiled.ellipsoid`` says: code, margin, half-sides of Q.
 
@@ -310,10 +310,9 @@ def ellipsoid(
     half = np.array([ops.up(ops.norm(row) * radius) for row in V])
     if not (np.isfinite(V).all() and np.isfinite(half).all()):
         return 1, -math.inf, np.zeros(size)
-    low, high = np.vstack([np.zeros((size, 2)), fixed]).T.copy()
-    centre = program(low, high)[:, 0] if centre is None else centre
-    low[:size], high[:size] = -half, half
-    whole = program(low, high, size)
+    if centre is None:
+        centre = program(np.concatenate([np.zeros(size), fixed]))[:, 0]
+    whole = program(np.concatenate([ops.between(-half, half), fixed]), size)
     if np.isnan(whole).any():  # something is undefined in Q
         return 2, -math.inf, half
     code, margin = ops.ellipsoid(V, whole, centre, W, radius, C, layer, limits)
@@ -342,24 +341,23 @@ class TerminalEllipsoid(Claim):
         require(radius > 0, "a radius > 0")
         return cls(matrix(data["W"], 2 * model.n, 2 * model.n), radius)
 
-    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Decision:
         """Decide the statement."""
         if law.switching == "sign":
-            return "undecided", "with sign(s) there is no layer to be inside of", {}, {}
+            return Decision("undecided", "with sign(s) there is no layer to be inside of")
         own = system(model, law)
         if (why := no_equilibrium(own)) is not None:
-            return "undecided", why, {}, {}
-        W = np.array([[hull(v, v) for v in row] for row in self.W])
+            return Decision("undecided", why)
         code, margin, half = ellipsoid(
-            ellipsoid_program(own), own.fixed(), W, hull(self.radius, self.radius)[1],
-            _rows(law), np.array([hull(v, v)[0] for v in law.layer]), input_limits(model),
+            ellipsoid_program(own), own.fixed(), ops.hulls(self.W), ops.hull(self.radius).imag,
+            _rows(law), ops.hulls(law.layer).real.copy(), input_limits(model),
         )  # fmt: skip
         details = {"margin": float(margin), "box": half.tolist()}
         witness = dict(zip(model.states, half.tolist(), strict=True))
         method = "interval Jacobian over the ellipsoid's box, diagonal dominance"
         if code == 0:
-            return "proved", method, witness, details
-        return "undecided", f"{method}: {REASONS[code]}", witness, details
+            return Decision("proved", method, witness, details)
+        return Decision("undecided", f"{method}: {REASONS[code]}", witness, details)
 
 
 def no_equilibrium(own: System, origin: Sequence[Span] | None = None) -> str | None:
@@ -372,10 +370,9 @@ def no_equilibrium(own: System, origin: Sequence[Span] | None = None) -> str | N
     return None if all(v.zero for v in free) else "f_u(0, 0) = 0 is not shown exactly"
 
 
-def _rows(law: Law) -> FloatArray:
-    """C of s = C x, enclosed, (m, 2n, 2)."""
-    blocks = zip(law.lambda_a, law.lambda_u, law.alpha_a, law.alpha_u, strict=True)
-    return np.array([[hull(v, v) for part in row for v in part] for row in blocks])
+def _rows(law: Law) -> Intervals:
+    """C of s = C x, enclosed, (m, 2n)."""
+    return np.hstack([*map(ops.hulls, (law.lambda_a, law.lambda_u, law.alpha_a, law.alpha_u))])
 
 
 # -- 5.5 ------------------------------------------------------------------------------------------
@@ -433,14 +430,14 @@ class SurfaceRegion(Claim):
         functions = tuple(_function(v, size) for v in listed)
         return cls(stretch, functions, contains, _read_plant(data["plant"], model))
 
-    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Decision:
         """Decide the statement."""
         names = (
             *surface_names(model),
             *(p.name for p in model.parameters if p.name in self.plant),
         )
         if len(names) > 8:
-            return "undecided", f"{len(names)} variables; 8 at most", {}, {}
+            return Decision("undecided", f"{len(names)} variables; 8 at most")
         method, boxes = "quadratic Taylor models, branch and bound", 0
         before: Function | None = None
         for k, V in enumerate(self.functions, start=1):
@@ -450,11 +447,11 @@ class SurfaceRegion(Claim):
             if found.kind != "proved":
                 why = f"{method}; function {k}: {found.why}"
                 witness = dict(zip(names, found.point, strict=False))
-                return found.kind, why, witness, {"boxes": boxes, "function": k}
+                return Decision(found.kind, why, witness, {"boxes": boxes, "function": k})
         line = on_the_line(self.stretch, self.functions[-1], self.contains, max_boxes)
         why = method if line.kind == "proved" else f"{method}; {line.why}, not so"
         witness = dict(zip(names, map(float, self.contains), strict=False))
-        return line.kind, why, witness, {"boxes": boxes + line.boxes}
+        return Decision(line.kind, why, witness, {"boxes": boxes + line.boxes})
 
 
 def surface_names(model: Model) -> tuple[str, ...]:
@@ -511,22 +508,22 @@ class ClosedLoop(Claim):
             terminal = TerminalEllipsoid.read(terminal, model)
         return cls(box, period, plant, bounds, ball, terminal, cuts, step)
 
-    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Decision:
         """Decide the statement."""
         if any(self.disturbance) or (self.plant and not self.period):
             why = "forces, and other plants under an input that is not held: not decided here"
-            return "undecided", why, {}, {}
+            return Decision("undecided", why)
         if law.switching != "saturation" or any(law.disturbance) or self.terminal is None:
             why = "saturation, constant gains and a terminal set are needed"
-            return "undecided", why, {}, {}
+            return Decision("undecided", why)
         if 2 * model.n + len(self.plant) > MOST_STATES:
-            return "undecided", f"more than {MOST_STATES} states and parameters that vary", {}, {}
+            return Decision("undecided", f"more than {MOST_STATES} states and parameters that vary")
         try:
             loop = self._loop(model, law, self.terminal)
         except ArithmeticError as error:
-            return "undecided", f"at the target: {error}", {}, {}
+            return Decision("undecided", f"at the target: {error}")
         if isinstance(loop, str):
-            return "undecided", f"the terminal set: {loop}", {}, {}
+            return Decision("undecided", f"the terminal set: {loop}")
         box = {x: self.starts.get(x, (Fraction(0), Fraction(0))) for x in model.states}
         wide = [x for x, (low, high) in box.items() if low < high]
         if wide and system(model, law).odd and all(low == -high for low, high in box.values()):
@@ -535,21 +532,21 @@ class ClosedLoop(Claim):
         pieces = []
         for name, (low, high) in box.items():
             cuts = sorted({v for v in self.cuts.get(name, ()) if low < v < high})
-            pieces.append([hull(*ends) for ends in itertools.pairwise([low, *cuts, high])])
+            parts = [ops.hull(*ends) for ends in itertools.pairwise([low, *cuts, high])]
+            pieces.append([(part.real, part.imag) for part in parts])
         end = loop.arrive(np.array([*itertools.product(*pieces)]))
         method = "validated tubes into an ellipsoid that is proved to be a terminal set"
         details = {"tubes": end.tubes, "steps": end.steps, "latest": end.latest}
         if not end.all:
             witness = dict(zip(box, end.lost.tolist(), strict=True))
-            return "undecided", f"{method}: a tube is lost", witness, details
-        return "proved", method, {}, details
+            return Decision("undecided", f"{method}: a tube is lost", witness, details)
+        return Decision("proved", method, details=details)
 
     def _loop(self, model: Model, law: Law, end: TerminalEllipsoid) -> Loop | str:
         """The loop with its terminal set, or what is not shown of that."""
         if not self.period:
-            kind, why, _, _ = end.decide(model, law, 0)
-            own = (model, law, end.W, end.radius, self.step)
-            return why if kind != "proved" else ContinuousLoop(*own)
+            found, own = end.decide(model, law, 0), (model, law, end.W, end.radius, self.step)
+            return found.why if found.kind != "proved" else ContinuousLoop(*own)
         loop = HeldLoop(model, law, self.period, self.plant)
         loop.take(end.W, end.radius)
         return loop.terminal()[0] or loop
@@ -582,7 +579,7 @@ def read_claim(data: Mapping[str, Any], model: Model) -> Claim:
 
 def decide(model: Model, law: Law, claim: Claim, max_boxes: int = MOST_BOXES) -> Decision:
     """Decide a claim about a model and a law."""
-    return Decision(*claim.decide(model, law, max_boxes))
+    return claim.decide(model, law, max_boxes)
 
 
 def check(

@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 from undertow.proofs.kernel import compiled as ops
 
-_NONE, _NO_SEEDS = np.empty(0, dtype=np.int64), np.empty((0, 0, 2))
+_NONE, _NO_SEEDS = np.empty(0, dtype=np.int64), np.empty((0, 0), dtype=complex)
 
 FloatArray = NDArray[np.float64]
+Intervals = NDArray[np.complex128]  # as ``compiled`` has them
 Array = NDArray[Any]  # of nodes
 
 _OPS = {
@@ -42,11 +43,6 @@ _MOST_BITS = 40_000
 
 #: Functions with a rational value at a rational number: (where, value).
 _KNOWN = {"sin": (0, 0), "cos": (0, 1), "exp": (0, 1), "log": (1, 0)}
-
-
-def hull(low: Fraction, high: Fraction) -> tuple[float, float]:
-    """Return doubles around [low, high]: the number itself, twice, where it is one."""
-    return ops.enclose(low)[0], ops.enclose(high)[1]
 
 
 class Span:
@@ -108,10 +104,11 @@ def _applied(kind: str, *of: Span) -> Span:
         return Span(_KNOWN[kind][1])
     if kind == "sqrt" and x.low > 0:
         return Span(_root(x.low)[0], _root(x.high)[1])
-    low, high = ops.apply(_OPS[kind], *hull(x.low, x.high), 0.0, 0.0)
-    if not (math.isfinite(low) and math.isfinite(high)):
+    near = ops.hull(x.low, x.high)
+    found = ops.apply(_OPS[kind], near, near)
+    if not np.isfinite(found):
         raise ZeroDivisionError(f"{kind} of a number where it may be undefined")
-    return Span(Fraction(low), Fraction(high))
+    return Span(Fraction(found.real), Fraction(found.imag))
 
 
 def _root(x: Fraction) -> tuple[Fraction, Fraction]:
@@ -135,32 +132,30 @@ class Program:
     code
         (K, 3): operation and two registers.
     constants
-        (C, 2): enclosures of the numbers.
+        (C,): enclosures of the numbers.
     outputs
         Registers of the results, (O,).
     """
 
     inputs: int
     code: NDArray[np.int64]
-    constants: FloatArray
+    constants: Intervals
     outputs: NDArray[np.int64]
 
-    def __call__(self, low: FloatArray, high: FloatArray, variables: int = 0) -> FloatArray:
-        """Enclose over a box (inputs,): values and derivatives by the first, (O, 1 + V, 2)."""
+    def __call__(self, box: Intervals, variables: int = 0) -> Intervals:
+        """Enclose over a box (inputs,): values and derivatives by the first, (O, 1 + V)."""
         seeds = ops.points(np.eye(variables))
-        jets = ops.jets(self.code, self.constants, low, high, _NONE, 0, seeds)
+        jets = ops.jets(self.code, self.constants, box, _NONE, 0, seeds)
         return np.asarray(jets[self.outputs, 0])
 
-    def series(
-        self, low: FloatArray, high: FloatArray, order: int, seeds: FloatArray = _NO_SEEDS
-    ) -> FloatArray:
+    def series(self, box: Intervals, order: int, seeds: Intervals = _NO_SEEDS) -> Intervals:
         """Enclose Taylor coefficients of motions ẋ = outputs of the first N inputs.
 
-        Returns (N, order + 1, 1 + V, 2): each with its derivatives by V variables; ``seeds``,
-        (S, V, 2), are those of the first inputs at time 0.
+        Returns (N, order + 1, 1 + V): each with its derivatives by V variables; ``seeds``,
+        (S, V), are those of the first inputs at time 0.
         """
         rates = self.outputs
-        jets = ops.jets(self.code, self.constants, low, high, rates, order, seeds)
+        jets = ops.jets(self.code, self.constants, box, rates, order, seeds)
         return np.asarray(jets[: len(rates)])
 
 
@@ -177,28 +172,28 @@ class Node:
         graph.size += 1
 
     def __add__(self, other: Other) -> Node:
-        return self.graph.both("add", self, other)
+        return self.graph.make("add", self, other)
 
     def __radd__(self, other: Other) -> Node:
-        return self.graph.both("add", other, self)
+        return self.graph.make("add", other, self)
 
     def __sub__(self, other: Other) -> Node:
-        return self.graph.both("sub", self, other)
+        return self.graph.make("sub", self, other)
 
     def __rsub__(self, other: Other) -> Node:
-        return self.graph.both("sub", other, self)
+        return self.graph.make("sub", other, self)
 
     def __mul__(self, other: Other) -> Node:
-        return self.graph.both("mul", self, other)
+        return self.graph.make("mul", self, other)
 
     def __rmul__(self, other: Other) -> Node:
-        return self.graph.both("mul", other, self)
+        return self.graph.make("mul", other, self)
 
     def __truediv__(self, other: Other) -> Node:
-        return self.graph.both("div", self, other)
+        return self.graph.make("div", self, other)
 
     def __rtruediv__(self, other: Other) -> Node:
-        return self.graph.both("div", other, self)
+        return self.graph.make("div", other, self)
 
     def __neg__(self) -> Node:
         return self.graph.make("neg", self)
@@ -237,8 +232,11 @@ class Graph:
         nodes = [v if isinstance(v, Node) else self.number(v) for v in given.flat]
         return np.array(nodes, dtype=object).reshape(given.shape)
 
-    def make(self, kind: str, *of: Node) -> Node:
-        """Return the node of an operation, folded where that is exact."""
+    def make(self, kind: str, *operands: Other) -> Node:
+        """Return the node of an operation on nodes or numbers, folded where that is exact."""
+        if any(isinstance(v, np.ndarray) for v in operands):
+            return NotImplemented  # type: ignore[no-any-return]
+        of = tuple(v if isinstance(v, Node) else self.number(v) for v in operands)
         if kind == "neg" and of[0].kind == "neg":
             return of[0].of[0]
         numbers = [k.number for k in of if k.number is not None]
@@ -248,12 +246,6 @@ class Graph:
             return simple
         safe = kind not in ("div", "sqrt", "log") or (kind == "div" and bool(of[1].number))
         return self._new(kind, of, None, safe and all(k.total for k in of))
-
-    def both(self, kind: str, a: Other, b: Other) -> Node:
-        """Return the node of an operation on two nodes or numbers."""
-        if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
-            return NotImplemented  # type: ignore[no-any-return]
-        return self.make(kind, *(v if isinstance(v, Node) else self.number(v) for v in (a, b)))
 
     def _simpler(self, kind: str, a: Node, b: Node) -> Node | None:
         x, y = a.number, b.number
@@ -289,7 +281,7 @@ class Graph:
         """Return tanh a = 1 − 2/(e^2a + 1); 0 at the number 0."""
         return 1 - 2 / (self.make("exp", 2 * a) + 1)
 
-    def clip(self, a: Node, limit: Node) -> Node:
+    def clip(self, a: Node, limit: Node | Fraction | int) -> Node:
         """Return min(max(a, −limit), limit)."""
         return self.make("min", self.make("max", a, -limit), limit)
 
@@ -346,7 +338,7 @@ class Graph:
             elif k.number is not None:
                 found[k] = Span(k.number)
             elif k.kind == "pi":
-                found[k] = Span(*(Fraction(v) for v in ops.PI))
+                found[k] = Span(Fraction(ops.PI.real), Fraction(ops.PI.imag))
             else:
                 found[k] = _applied(k.kind, *(found[j] for j in k.of))
             low = found[k].low
@@ -360,11 +352,11 @@ class Graph:
         ``sides`` has an operand for a max or min: the one that it is known to be.
         """
         needed, place = depends(roots, sides), {k: k.index for k in self.inputs}
-        constants: list[tuple[float, float]] = []
+        constants = list[complex]()
         for k in needed:
             if k.kind in ("number", "pi"):
                 place[k] = len(self.inputs) + len(constants)
-                constants.append(ops.PI if k.number is None else ops.enclose(k.number))
+                constants.append(ops.PI if k.number is None else ops.hull(k.number))
         base, lines = len(self.inputs) + len(constants), list[tuple[int, int, int]]()
         sines = dict[int, int]()  # sin and cos of one operand stand together
         for k in needed:
@@ -386,7 +378,7 @@ class Graph:
         return Program(
             len(self.inputs),
             np.array(lines, dtype=np.int64).reshape(-1, 3),
-            np.array(constants, dtype=float).reshape(-1, 2),
+            np.array(constants, dtype=complex),
             np.array([place[k] for k in roots], dtype=np.int64),
         )
 

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from undertow.proofs.kernel.graph import Array, FloatArray, Graph, Node, Span, hull
+from undertow.proofs.kernel.compiled import hull, hulls
+from undertow.proofs.kernel.graph import Array, FloatArray, Graph, Intervals, Node, Span
 
 Matrix = tuple[tuple[Fraction, ...], ...]
 
@@ -266,9 +267,10 @@ class System:
 
     def _beyond(self, demand: Node, own: Quantity) -> Node:
         """What the clip takes off a demand."""
-        make, end, zero = self.graph.make, self.graph.number(own.value or 0), self.graph.number(0)
-        over = make("max", demand - end, zero) + make("min", demand + end, zero)
-        return zero if own.value is None else over
+        if own.value is None:
+            return self.graph.number(0)
+        make = self.graph.make
+        return make("max", demand - own.value, 0) + make("min", demand + own.value, 0)
 
     @property
     def regular(self) -> list[Node]:
@@ -318,7 +320,7 @@ class System:
         if self.law.switching == "tanh":
             ratio = np.array([graph.tanh(r) for r in ratio], dtype=object)
         elif not layer:
-            ratio = np.array([graph.clip(r, graph.number(1)) for r in ratio], dtype=object)
+            ratio = np.array([graph.clip(r, 1) for r in ratio], dtype=object)
         return np.asarray(self.gains * ratio)
 
     def loop(self, push: Array) -> tuple[list[Node], Array]:
@@ -332,10 +334,9 @@ class System:
         demand = self.B_adjugate @ (self.S @ w - h) / self.B_determinant
         return [*w, *(y - self.X @ w)], demand
 
-    def fixed(self) -> FloatArray:
+    def fixed(self) -> Intervals:
         """Enclosures of the parameters."""
-        values = [p.value for p in self.model.parameters]
-        return np.array([hull(v, v) for v in values if v is not None]).reshape(-1, 2)
+        return np.asarray(hulls([p.value for p in self.model.parameters]))
 
     def origin(self) -> list[Span]:
         """Exact inputs at x = 0."""
@@ -345,7 +346,7 @@ class System:
 
 def input_limits(model: Model) -> FloatArray:
     """Lower bounds of the input limits, (m,), ∞ for none."""
-    ends = [math.inf if i.value is None else hull(i.value, i.value)[0] for i in model.inputs]
+    ends = [math.inf if i.value is None else hull(i.value).real for i in model.inputs]
     return np.array(ends)
 
 

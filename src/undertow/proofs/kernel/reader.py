@@ -5,15 +5,12 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
 from undertow.proofs.kernel.model import Law, Matrix, Model, Quantity
-
-__all__ = ["Document", "Refused", "Subject", "canonical", "digest", "interval", "matrix", "number",
-           "numbers", "read", "read_law", "read_model"]  # fmt: skip
 
 FORMAT, VERSION = "undertow-certificate", 2
 
@@ -221,11 +218,8 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return dict(pairs)
 
 
-def _refuse(what: str) -> Callable[[str], Any]:
-    def refuse(text: str) -> Any:
-        raise Refused(f"{what}, {text[:40]}")
-
-    return refuse
+def _refuse(text: str) -> Any:
+    raise Refused(f"a JSON number that is not whole: {text[:40]}")
 
 
 def _whole(text: str) -> int:
@@ -248,8 +242,7 @@ def parse(content: bytes) -> dict[str, Any]:
     try:
         data = json.loads(
             text, object_pairs_hook=_object, parse_int=_whole,
-            parse_float=_refuse("a JSON number that is not whole"),
-            parse_constant=_refuse("no number"),
+            parse_float=_refuse, parse_constant=_refuse,
         )  # fmt: skip
     except (json.JSONDecodeError, RecursionError) as error:
         raise Refused(f"no JSON: {error}") from error

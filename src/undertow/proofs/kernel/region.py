@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.bound import Goal, Settled, halved, settle
-from undertow.proofs.kernel.graph import Array, FloatArray, Graph, Node, Program, Span, hull
+from undertow.proofs.kernel.graph import Array, FloatArray, Graph, Intervals, Node, Program, Span
 from undertow.proofs.kernel.model import Law, Matrix, Model, Sliding, identity, inverse
 
 #: Boxes that are looked at together, and points of them that are tried for a counterexample.
@@ -110,9 +110,10 @@ def on_the_line(stretch: Stretch, V: Function, end: Sequence[Fraction], max_boxe
     y = graph.inputs[0] * graph.numbers(end)
     chart = _Chart(graph, stretch, y[0], len(y))
     nodes = chart.value(V, chart.total @ y)
-    goals = [Goal(f"{what} ≤ 1 on the line", -1, (-1.0, -1.0), False) for what in ("V", "|G c|²")]
+    most = ops.point(-1.0)  # V ≤ 1 as −V ≥ −1
+    goals = [Goal(f"{what} ≤ 1 on the line", -1, most, False) for what in ("V", "|G c|²")]
     box = [(Fraction(0), Fraction(1))]
-    return settle(graph.program(nodes), box, np.empty((0, 2)), goals, max_boxes)
+    return settle(graph.program(nodes), box, np.empty(0, dtype=complex), goals, max_boxes)
 
 
 class Stage:
@@ -161,8 +162,8 @@ class Stage:
             return Settled("undecided", f"at the target: {error}", (), 0)
         if self.half is None:
             return Settled("undecided", "the guard reaches the pole", (), 0)
-        side = np.array([hull(Fraction(v), Fraction(v))[1] for v in self.sides])
-        ends = np.array([hull(*e) for e in self.plant]).reshape(-1, 2)
+        side, plant = ops.hulls(self.sides).imag, [ops.hull(*ends) for ends in self.plant]
+        ends = np.array([(p.real, p.imag) for p in plant]).reshape(-1, 2)
         core = np.zeros(self.size)
         if self.inner is None:
             found = self._core(0.25 * side, ends)
@@ -183,9 +184,9 @@ class Stage:
         ]
 
         def falls(part: FloatArray) -> bool:
-            low, high = np.append(-cube, part[:, 0]), np.append(cube, part[:, 1])
-            H = slope(low, high, N)[:, 1:]
-            return bool((pivots(low, high)[:, 0, 0] > 0).all()) and _negative_definite(H)
+            box = ops.between(np.append(-cube, part[:, 0]), np.append(cube, part[:, 1]))
+            H = slope(box, N)[:, 1:]
+            return bool((pivots(box).real > 0).all()) and _negative_definite(H)
 
         for _ in range(24):
             if all(falls(part) for part in slices):
@@ -195,13 +196,13 @@ class Stage:
 
     def _false(self, a: FloatArray) -> str:
         """What is false for certain at a point, if anything."""
-        values = self.program(a, a)[:, 0]
+        values = self.program(ops.between(a, a))[:, 0]
         count = 2 if self.inner is None else 3
-        outside = self.inner is None or values[2, 0] > 1.0
-        if values[1, 1] <= 1.0 and values[count, 1] <= 1.0:
-            if outside and values[0, 0] > 0.0:
+        outside = self.inner is None or values[2].real > 1.0
+        if values[1].imag <= 1.0 and values[count].imag <= 1.0:
+            if outside and values[0].real > 0.0:
                 return "V̇ < 0"
-            if (values[-len(self.pivots) :, 1] <= 0.0).any():
+            if (values[-len(self.pivots) :].imag <= 0.0).any():
                 return "M ≻ 0"
         return ""
 
@@ -213,7 +214,7 @@ class Stage:
         program: Program = self.program
         models = ops.models(program.code, program.constants, program.outputs, a, b)
         values, spread = ops.ranges(models, V)
-        low, high = values[..., 0], values[..., 1]
+        low, high = values.real, values.imag
         count = 2 if self.inner is None else 3  # then the guards
         ring = models[:, :3].copy()
         if self.inner is None:
@@ -262,17 +263,18 @@ class Stage:
         return Settled("proved", "", (), count)
 
     def _named(self, point: FloatArray) -> tuple[float, ...]:
-        return (*self.y(point, point)[:, 0].mean(axis=1).tolist(), *point[self.size :].tolist())
+        y = self.y(ops.between(point, point))[:, 0]
+        return (*(0.5 * (y.real + y.imag)).tolist(), *point[self.size :].tolist())
 
 
-def _negative_definite(H: FloatArray) -> bool:
-    """Whether every symmetric matrix in H (N, N, 2) is: −Sᵀ H S ≻ 0, then S is invertible too."""
-    middle = 0.5 * (H[..., 0] + H[..., 1])
+def _negative_definite(H: Intervals) -> bool:
+    """Whether every symmetric matrix in H (N, N) is: −Sᵀ H S ≻ 0, then S is invertible too."""
+    middle = 0.5 * (H.real + H.imag)
     if not np.isfinite(middle).all():
         return False
     values, vectors = np.linalg.eigh(-0.5 * (middle + middle.T))
     if not values[0] > 0:
         return False
     S = ops.points(vectors / np.sqrt(values))
-    turned = ops.product(ops.product(np.ascontiguousarray(S.transpose(1, 0, 2)), H), S)
-    return bool(ops.dominance(np.ascontiguousarray(-turned[..., ::-1])) > 0.0)
+    turned = ops.product(ops.product(np.ascontiguousarray(S.T), H), S)
+    return bool(ops.dominance(ops.between(-turned.imag, -turned.real)) > 0.0)

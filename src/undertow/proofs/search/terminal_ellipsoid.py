@@ -215,7 +215,7 @@ def search_for(
     at_target = loop.at_target(numbers)
     gradients = at_target[:, 1:]
     n, rows = loop.n, loop.rows(numbers)
-    A = np.vstack([np.eye(n, 2 * n, n), gradients[:n].mean(axis=-1)])
+    A = np.vstack([np.eye(n, 2 * n, n), 0.5 * (gradients.real + gradients.imag)[:n]])
     limits, centre = mechanism.input_limits, at_target[:, 0].copy()
 
     def margin(candidate: TerminalEllipsoid) -> float:
