@@ -187,14 +187,15 @@ class ClosedLoopProgram:
         values = [Span(0)] * (2 * self.n) + [
             Span(Fraction(float(v))) for v in mechanism.parameter_values
         ]
-        return kernel.no_equilibrium(self.own, values) is None
+        return not self.own.graph.not_zero(self.own.f[self.m :], values, "f_u(0, 0) = 0")
 
-    def over(self, low: FloatArray, high: FloatArray, variables: int = 0) -> Intervals:
-        """Enclose the outputs over a box of inputs, (O, 1 + variables)."""
-        return self.program(between(low, high), variables)
+    def over(self, low: FloatArray, high: FloatArray, variables: int = 0) -> FloatArray:
+        """Enclose the outputs over a box of inputs, (O, 1 + variables, 2)."""
+        found = self.program(between(low, high), variables)
+        return np.stack([found.real, found.imag], axis=-1)
 
-    def at_target(self, numbers: FloatArray) -> Intervals:
-        """Return enclosures of the outputs and of their gradients at x = 0, (O, 1 + 2n)."""
+    def at_target(self, numbers: FloatArray) -> FloatArray:
+        """Return enclosures of the outputs and of their gradients at x = 0, (O, 1 + 2n, 2)."""
         point = np.concatenate([np.zeros(2 * self.n), numbers])
         return self.over(point, point, 2 * self.n)
 

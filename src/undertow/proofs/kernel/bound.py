@@ -89,9 +89,8 @@ def settle(
     fixed
         Enclosures of the others, (F,).
     """
-    whole = np.array([ops.hull(*ends) for ends in box])
-    low, high = whole.real[:, None], whole.imag[:, None]
-    ends = np.hstack([low, high])
+    ends = ops.ends(box)
+    low, high = ends[:, :1], ends[:, 1:]
     corners = np.array(list(itertools.product(*ends))).T if len(box) <= 10 else low
     count = 0
     signs = np.array([g.sign for g in goals])

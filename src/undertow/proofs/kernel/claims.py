@@ -346,8 +346,8 @@ class TerminalEllipsoid(Claim):
         if law.switching == "sign":
             return Decision("undecided", "with sign(s) there is no layer to be inside of")
         own = system(model, law)
-        if (why := no_equilibrium(own)) is not None:
-            return Decision("undecided", why)
+        if why := own.graph.not_zero(own.f[model.m :], own.origin(), "f_u(0, 0) = 0"):
+            return Decision("undecided", why)  # and if it is, q̈ = 0
         code, margin, half = ellipsoid(
             ellipsoid_program(own), own.fixed(), ops.hulls(self.W), ops.hull(self.radius).imag,
             _rows(law), ops.hulls(law.layer).real.copy(), input_limits(model),
@@ -358,16 +358,6 @@ class TerminalEllipsoid(Claim):
         if code == 0:
             return Decision("proved", method, witness, details)
         return Decision("undecided", f"{method}: {REASONS[code]}", witness, details)
-
-
-def no_equilibrium(own: System, origin: Sequence[Span] | None = None) -> str | None:
-    """Why the target is not shown to be at rest, or None: f_u(0, 0) = 0 and then q̈ = 0."""
-    try:
-        at = own.origin() if origin is None else origin
-        free = own.graph.exact(own.f[own.model.m :], at)
-    except ArithmeticError as error:
-        return f"at the target: {error}"
-    return None if all(v.zero for v in free) else "f_u(0, 0) = 0 is not shown exactly"
 
 
 def _rows(law: Law) -> Intervals:
@@ -532,8 +522,7 @@ class ClosedLoop(Claim):
         pieces = []
         for name, (low, high) in box.items():
             cuts = sorted({v for v in self.cuts.get(name, ()) if low < v < high})
-            parts = [ops.hull(*ends) for ends in itertools.pairwise([low, *cuts, high])]
-            pieces.append([(part.real, part.imag) for part in parts])
+            pieces.append(ops.ends(itertools.pairwise([low, *cuts, high])))
         end = loop.arrive(np.array([*itertools.product(*pieces)]))
         method = "validated tubes into an ellipsoid that is proved to be a terminal set"
         details = {"tubes": end.tubes, "steps": end.steps, "latest": end.latest}

@@ -56,6 +56,12 @@ def hulls(values: Any) -> Any:
     return np.array([hull(v) for v in given.flat], dtype=complex).reshape(given.shape)
 
 
+def ends(boxes: Any) -> Any:
+    """Return the ends, (N, 2), of doubles around intervals of rational numbers, N pairs."""
+    around = [hull(low, high) for low, high in boxes]
+    return np.array([(x.real, x.imag) for x in around]).reshape(-1, 2)
+
+
 def between(low: Any, high: Any) -> Any:
     """Return the array of intervals with these ends."""
     out = np.empty(np.shape(low), dtype=complex)

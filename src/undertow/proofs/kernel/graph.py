@@ -127,8 +127,6 @@ class Program:
 
     Parameters
     ----------
-    inputs
-        Number of inputs, which come first.
     code
         (K, 3): operation and two registers.
     constants
@@ -137,7 +135,6 @@ class Program:
         Registers of the results, (O,).
     """
 
-    inputs: int
     code: NDArray[np.int64]
     constants: Intervals
     outputs: NDArray[np.int64]
@@ -346,6 +343,14 @@ class Graph:
                 raise ArithmeticError(f"a number of more than {_MOST_BITS} bits")
         return [found[k] for k in roots]
 
+    def not_zero(self, roots: Collection[Node], at: Sequence[Span], what: str) -> str:
+        """Why nodes are not shown to be 0 at exact values of inputs, if they are not."""
+        try:
+            zero = all(v.zero for v in self.exact(roots, at))
+        except ArithmeticError as error:
+            return f"at the target: {error}"
+        return "" if zero else f"{what} is not shown exactly"
+
     def program(self, roots: Collection[Node], sides: Sides = NOWHERE) -> Program:
         """Lower what some nodes depend on; every input stays one.
 
@@ -376,7 +381,6 @@ class Graph:
             place[k] = here
             lines.append((_OPS[k.kind], of[0], of[-1]))
         return Program(
-            len(self.inputs),
             np.array(lines, dtype=np.int64).reshape(-1, 3),
             np.array(constants, dtype=complex),
             np.array([place[k] for k in roots], dtype=np.int64),

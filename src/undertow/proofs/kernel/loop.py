@@ -203,11 +203,7 @@ class HeldLoop(Loop):
         """Why the target is not shown to be at rest with u = 0 for every plant, if it is not."""
         rest = [Span(0)] * (len(self.graph.inputs) - self.size - len(self.plant))
         at = [*([Span(0)] * self.size), *(Span(*ends) for ends in self.plant), *rest]
-        try:
-            values = self.graph.exact([*self.rates, *self.demand], at)
-        except ArithmeticError as error:
-            return f"at the target: {error}"
-        return "" if all(v.zero for v in values) else "f(0, 0) = 0 is not shown exactly"
+        return self.graph.not_zero([*self.rates, *self.demand], at, "f(0, 0) = 0")
 
     def terminal(self) -> tuple[str, float]:
         """Decide Lemma 11 of the set: what is not shown, or nothing, and a margin."""
@@ -219,8 +215,7 @@ class HeldLoop(Loop):
             return "W is not shown to be invertible", -np.inf
         if not (half[self.size - self.model.m :] <= ops.hulls(self.law.layer).real).all():
             return "the boundary layer is left", -np.inf
-        plant = [ops.hull(*ends) for ends in self.plant]
-        whole = np.array([(p.real, p.imag) for p in plant]).reshape(-1, 2)
+        whole = ops.ends(self.plant)
         box, todo, tried = np.column_stack([-half, half]), [whole], 0
         while todo:
             part, tried = todo.pop(), tried + 1

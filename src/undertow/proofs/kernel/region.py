@@ -154,16 +154,12 @@ class Stage:
 
     def decide(self, max_boxes: int) -> Settled:
         """Decide (1) to (3) of the statement for this function."""
-        try:
-            at = [Span(0)] * self.size + [Span(*ends) for ends in self.plant]
-            if not all(v.zero for v in self.graph.exact(self.rates, at)):
-                return Settled("undecided", "F(0) = 0 is not shown exactly", (), 0)
-        except ArithmeticError as error:
-            return Settled("undecided", f"at the target: {error}", (), 0)
+        at = [Span(0)] * self.size + [Span(*ends) for ends in self.plant]
+        if why := self.graph.not_zero(self.rates, at, "F(0) = 0"):
+            return Settled("undecided", why, (), 0)
         if self.half is None:
             return Settled("undecided", "the guard reaches the pole", (), 0)
-        side, plant = ops.hulls(self.sides).imag, [ops.hull(*ends) for ends in self.plant]
-        ends = np.array([(p.real, p.imag) for p in plant]).reshape(-1, 2)
+        side, ends = ops.hulls(self.sides).imag, ops.ends(self.plant)
         core = np.zeros(self.size)
         if self.inner is None:
             found = self._core(0.25 * side, ends)
