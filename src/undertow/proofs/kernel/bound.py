@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.graph import FloatArray, Intervals, Program
 
-Pair = tuple[Intervals, Intervals]
-
 #: Boxes that are looked at together, and points of them that are tried for a counterexample.
 CHUNK, TRIED = 512, 16
 
@@ -25,7 +23,7 @@ class Goal:
 
     what: str
     sign: int = 1
-    bound: complex = 0j
+    bound: complex = complex(0.0, 0.0)
     strict: bool = True
 
 
@@ -51,15 +49,9 @@ def over_boxes(
     spreads = np.empty((len(program.outputs), V, boxes))
     for k in range(boxes):
         box, m = ops.between(low[:, k], high[:, k]), 0.5 * low[:, k] + 0.5 * high[:, k]
-        whole, centre = expanded(program, box, m, fixed)
+        whole, centre = program.expanded(box, m, fixed)
         values[:, k], spreads[:, :, k] = ops.mean_values(whole, centre, box, m)
     return values, spreads
-
-
-def expanded(program: Program, box: Intervals, m: FloatArray, fixed: Intervals) -> Pair:
-    """Enclose values and derivatives over a box, (O, 1 + N), and values at m, (O,)."""
-    whole = program(np.concatenate([box, fixed]), len(m))
-    return whole, program(np.concatenate([ops.between(m, m), fixed]))[:, 0]
 
 
 def halved(

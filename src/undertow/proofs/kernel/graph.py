@@ -23,6 +23,7 @@ _NONE, _NO_SEEDS = np.empty(0, dtype=np.int64), np.empty((0, 0), dtype=complex)
 
 FloatArray = NDArray[np.float64]
 Intervals = NDArray[np.complex128]  # as ``compiled`` has them
+Pair = tuple[Intervals, Intervals]
 Array = NDArray[Any]  # of nodes
 
 _OPS = {
@@ -144,6 +145,14 @@ class Program:
         seeds = ops.points(np.eye(variables))
         jets = ops.jets(self.code, self.constants, box, _NONE, 0, seeds)
         return np.asarray(jets[self.outputs, 0])
+
+    def expanded(self, box: Intervals, m: FloatArray, fixed: Intervals) -> Pair:
+        """Enclose values and derivatives by the first inputs, (O, 1 + N), and values at m, (O,).
+
+        Over a box of them, (N,), m inside; ``fixed`` are the other inputs.
+        """
+        whole = self(np.concatenate([box, fixed]), len(m))
+        return whole, self(np.concatenate([ops.between(m, m), fixed]))[:, 0]
 
     def series(self, box: Intervals, order: int, seeds: Intervals = _NO_SEEDS) -> Intervals:
         """Enclose Taylor coefficients of motions ẋ = outputs of the first N inputs.

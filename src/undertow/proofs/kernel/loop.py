@@ -13,7 +13,6 @@ from functools import cached_property
 import numpy as np
 
 from undertow.proofs.kernel import compiled as ops
-from undertow.proofs.kernel.bound import expanded
 from undertow.proofs.kernel.graph import Array, FloatArray, Graph, Intervals, Program, Span
 from undertow.proofs.kernel.model import Law, Matrix, Model, System, input_limits, scale_of, system
 from undertow.proofs.kernel.tube import Field, Held, Sampled, Tube
@@ -233,7 +232,7 @@ class HeldLoop(Loop):
         """Return z = 0 at the middle of plants, and the demand's derivatives on X."""
         m, none, plant = self.model.m, np.zeros(self.model.m, dtype=complex), X[self.size :]
         middle = np.append(np.zeros(self.size), 0.5 * (plant.real + plant.imag))
-        over, at = expanded(self.inside, X, middle, self.held.fixed())
+        over, at = self.inside.expanded(X, middle, self.held.fixed())
         L = ops.mean_values(over, at, X, middle)[0]
         return middle, Sampled(none, none, L[m:], at[m:], over[m:, 1:])
 

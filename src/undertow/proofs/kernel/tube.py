@@ -17,13 +17,13 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from undertow.proofs.kernel import compiled as ops
-from undertow.proofs.kernel.bound import Pair, expanded
 from undertow.proofs.kernel.graph import (
     NOWHERE,
     FloatArray,
     Graph,
     Intervals,
     Node,
+    Pair,
     Program,
     Sides,
     corners,
@@ -95,7 +95,7 @@ class Field:
             return None
         box = np.concatenate([stay, tube.fixed])
         way = ops.moved(np.zeros_like(X), self.whole(box)[:, 0], complex(0.0, h))[:, None]
-        gaps = expanded(self.gaps, stay, tube.m, tube.fixed)
+        gaps = self.gaps.expanded(stay, tube.m, tube.fixed)
         program, decided = self.piece(ops.along(*gaps, tube.C, tube.xi, way))
         if not decided and not short:
             return None
@@ -172,7 +172,7 @@ class Held:
         of several, and the same everywhere.
         """
         none, options, slopes = self.fixed(), list[list[int]](), list[Intervals]()
-        gaps = ops.along(*expanded(self.gaps, tube.hull, tube.m, none), *tube.parts)
+        gaps = ops.along(*self.gaps.expanded(tube.hull, tube.m, none), *tube.parts)
         for gap, k in zip(gaps, self._corners, strict=True):
             larger = int(k.kind == "max")  # where the gap is below 0
             sure = [larger] if gap.imag <= 0.0 else [1 - larger] if gap.real >= 0.0 else [0, 1]
@@ -181,14 +181,14 @@ class Held:
             if piece not in self._pieces:
                 sides = {k: k.of[i] for k, i in zip(self._corners, piece, strict=True)}
                 self._pieces[piece] = self.by_states(self.law, sides)
-            own, at = expanded(self._pieces[piece], tube.hull, tube.m, none)
+            own, at = self._pieces[piece].expanded(tube.hull, tube.m, none)
             slopes.append(ops.along(own, at, *tube.parts)[self.m :])
         every = np.array(slopes)
         L = ops.between(every.real.min(axis=0), every.imag.max(axis=0))
         L_m, D = at[self.m :], own[self.m :, 1:]
         if len(slopes) > 1:
             L_m, D = L, np.zeros_like(D)
-        around, centre = expanded(self.renewed, tube.hull, tube.m, none)
+        around, centre = self.renewed.expanded(tube.hull, tube.m, none)
         around[:, 1:] = L.reshape(self.m, self.N)
         return Sampled(ops.along(around, centre, *tube.parts), centre, L, L_m, D)
 
@@ -269,7 +269,7 @@ class Tube:
 
     def values(self, program: Program) -> Pair:
         """Enclose values and derivatives over the hull, (O, 1 + N), and values at m, (O,)."""
-        return expanded(program, self.hull, self.m, self.fixed)
+        return program.expanded(self.hull, self.m, self.fixed)
 
     def image(self, program: Program) -> Intervals:
         """Enclose values on the set, (O,)."""
