@@ -207,6 +207,24 @@ def test_zero_times_undefined_is_undefined() -> None:
     assert np.isnan(values[2])
 
 
+def test_formulas_on_arrays_are_those_of_their_nodes() -> None:
+    """Equal ones are one object, with numbers and arrays on either side; 0 · y falls away."""
+    graph = Graph(2)
+    x, y = graph.inputs
+    make = graph.make
+    first, second = np.array([[x, graph.number(0)], [y, 1 / x]], dtype=object) @ graph.inputs
+    assert first is make("sqr", x)
+    assert second is make("add", make("mul", y, x), make("mul", make("div", 1, x), y))
+    assert list(2 - graph.inputs) == [make("sub", 2, x), make("sub", 2, y)]
+    assert list(y / graph.inputs) == [make("div", y, x), make("div", y, y)]
+    thirds = graph.numbers([Fraction(1, 3), 2])
+    assert thirds @ -abs(graph.inputs) is make(
+        "add",
+        make("mul", Fraction(1, 3), make("neg", make("abs", x))),
+        make("mul", 2, make("neg", make("abs", y))),
+    )
+
+
 def test_a_root_of_a_square_is_no_way_round_a_kink() -> None:
     """√(x²) is refused where x may be 0, and is |x| elsewhere."""
     graph = Graph(1)
