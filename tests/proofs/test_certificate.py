@@ -39,9 +39,10 @@ from undertow.proofs.claims.region import RegionClaim, reaches, verify_region
 from undertow.proofs.claims.stability import hurwitz
 from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
 from undertow.proofs.claims.verify import match, proved_sets, verify
+from undertow.proofs.claims.written import number_text
 from undertow.proofs.gate import GatePolicy, assess
 from undertow.proofs.kernel import claims as kernel
-from undertow.proofs.kernel.reader import LARGEST, Refused, digest, number_text
+from undertow.proofs.kernel.reader import LARGEST, Refused, digest
 from undertow.proofs.region.lyapunov import LyapunovFunction
 from undertow.proofs.region.motion import SurfaceMotion
 from undertow.proofs.search.terminal_ellipsoid import search_for

@@ -21,13 +21,16 @@ from undertow.law import ReachingLaw, SlidingModeLaw
 from undertow.models import FloatArray
 from undertow.proofs.claims.closed_loop import LoopClaim
 from undertow.proofs.claims.model_data import law_of, model_of
+from undertow.proofs.claims.words import sentence
+from undertow.proofs.claims.written import claim_data
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.claims import ClosedLoop, TerminalEllipsoid, decide, read_claim
-from undertow.proofs.kernel.graph import Graph, Program
+from undertow.proofs.kernel.compiled import between
+from undertow.proofs.kernel.graph import Graph, Intervals, Program
 from undertow.proofs.kernel.loop import HeldLoop
 from undertow.proofs.kernel.model import Model, System, scale_of
 from undertow.proofs.kernel.reader import Refused, read
-from undertow.proofs.kernel.tube import _folded
+from undertow.proofs.kernel.tube import Tube, _folded
 from undertow.proofs.search.closed_loop import _for_all_plants, follow, prove_loop
 from undertow.studies.paper.appendix import CASES
 
@@ -85,6 +88,10 @@ def sampled(
     return path
 
 
+def widths_of(tube: Tube) -> FloatArray:
+    return tube.hull.imag - tube.hull.real
+
+
 # -- tubes ----------------------------------------------------------------------------------------
 
 
@@ -120,10 +127,10 @@ def misses(name: str, count: int, seed: int, part: float) -> tuple[int, int, lis
                     break
                 seen += 1
                 wrong += not all(
-                    exact(low) <= v <= exact(high)
-                    for v, (low, high) in zip(there, tube.image(back), strict=True)
+                    exact(own.real) <= v <= exact(own.imag)
+                    for v, own in zip(there, tube.image(back), strict=True)
                 )
-                widths.append(float((tube.hull[: 2 * n, 1] - tube.hull[: 2 * n, 0]).max()))
+                widths.append(float(widths_of(tube)[: 2 * n].max()))
     return wrong, seen, widths
 
 
@@ -149,15 +156,15 @@ def test_a_set_of_fewer_columns_holds_the_set() -> None:
     """In random directions it reaches as far, in exact arithmetic, and hardly farther."""
     rng = np.random.default_rng(11)
 
-    def reach(C: FloatArray, xi: FloatArray, way: FloatArray) -> Fraction:
+    def reach(C: FloatArray, xi: Intervals, way: FloatArray) -> Fraction:
         total = Fraction(0)
         for column, ends in zip(C.T, xi[:, 0], strict=True):
             slope = sum(Fraction(a) * Fraction(b) for a, b in zip(column, way, strict=True))
-            total += max(slope * Fraction(v) for v in ends)
+            total += max(slope * Fraction(v) for v in (ends.real, ends.imag))
         return total
 
     C = rng.normal(size=(4, 60)) * np.exp(rng.normal(size=(4, 60)) * 2)
-    xi = np.stack([-rng.random((60, 1)), rng.random((60, 1))], axis=-1)
+    xi = between(-rng.random((60, 1)), rng.random((60, 1)))
     fewer = _folded(C, xi, 20)
     assert fewer[0].shape == (4, 24)
     for _ in range(50):
@@ -186,12 +193,14 @@ def test_wide_tubes_hold_motions_across_clip_and_layer() -> None:
     met = set[tuple[bool, bool]]()
     for k in range(1, 451):
         assert loop.advance(tube)
-        x, (low, high) = paths[:, k], tube.image(back).T
+        x, around = paths[:, k], tube.image(back)
+        low, high = around.real, around.imag
         assert (x >= low - 1e-8).all()
         assert (x <= high + 1e-8).all()
         assert (high - low).max() < 0.01
         demand = np.array([law(0.0, v).demand for v in x])
-        met.add((bool((abs(demand) > 15).all()), bool((np.abs(tube.hull[3]) < 0.1).all())))
+        inside = np.abs(tube.hull[3:4].view(float)) < 0.1
+        met.add((bool((abs(demand) > 15).all()), bool(inside.all())))
     assert met >= {(True, False), (False, False), (False, True)}
 
 
@@ -211,14 +220,14 @@ def test_a_set_across_an_edge_of_the_layer_falls_together() -> None:
     widest = 0.0
     for k in range(1, 261):
         assert loop.advance(tube)
-        x, (low, high) = paths[:, k], tube.image(back).T
-        assert (x >= low - 1e-8).all()
-        assert (x <= high + 1e-8).all()
-        widest = max(widest, float(np.ptp(tube.hull[3])))
+        x, around = paths[:, k], tube.image(back)
+        assert (x >= around.real - 1e-8).all()
+        assert (x <= around.imag + 1e-8).all()
+        widest = max(widest, float(widths_of(tube)[3]))
     assert widest < 1.0
-    assert np.ptp(tube.hull[3]) < 0.02
+    assert widths_of(tube)[3] < 0.02
     going = all(plain._advance(whole) for _ in range(260))
-    assert not going or np.ptp(whole.hull[3]) > 0.1
+    assert not going or widths_of(whole)[3] > 0.1
 
 
 # -- the terminal set -----------------------------------------------------------------------------
@@ -229,32 +238,32 @@ def test_the_derivative_of_the_map_holds_difference_quotients() -> None:
     loop = HeldLoop(MODEL, NUMBERS, PERIOD, within("1/50", "m"))
     loop.take(END.W, END.radius)
     V = ops.inverse(loop.W)
-    half = np.array([ops.norm(row) * loop.radius[1] for row in V])
+    half = np.array([ops.norm(row) * loop.radius.imag for row in V])
     mass = [0.1225, 0.1275]
-    X = np.vstack([np.column_stack([-half, half]), [mass]])
+    X = between(np.append(-half, mass[0]), np.append(half, mass[1]))
     middle, demand = loop.slopes(X)
-    demand = demand._replace(u=np.array([[-15.0, 15.0]]))
+    demand = demand._replace(u=between([-15.0], [15.0]))
     found = loop.held.derivative(X, middle, demand, loop.step)
     assert found is not None
     J, back, law = found[0], states(loop), SlidingModeLaw(RIG, SURFACE, LAW)
 
     def image(z: FloatArray) -> FloatArray:
-        x = back(z, z)[:, 0].mean(axis=1)
+        x = back(between(z, z))[:, 0].real
         plant = RIG.with_parameters(m=float(z[4]))
         after = np.r_[sampled(plant, x, 0.001, 1, law)[1], z[4]]
-        return np.asarray(loop.coordinates(after, after)[:, 0].mean(axis=1))
+        return loop.coordinates(between(after, after))[:, 0].real
 
     rng, h = np.random.default_rng(3), np.array([1e-6, 1e-6, 1e-6, 1e-6, 1e-5])
     for _ in range(10):
         ball = rng.normal(size=4)
-        z = V.mean(axis=-1) @ (0.9 * loop.radius[0] * ball / np.linalg.norm(ball))
+        z = V.real @ (0.9 * loop.radius.real * ball / np.linalg.norm(ball))
         point = np.r_[z, rng.uniform(mass[0], mass[1])]
         for j in range(5):
             step = h[j] * np.eye(5)[j]
             quotient = (image(point + step) - image(point - step)) / (2 * h[j])
-            assert (quotient >= J[:, j, 0] - 1e-5).all()
-            assert (quotient <= J[:, j, 1] + 1e-5).all()
-    assert (J[..., 1] - J[..., 0])[:4, :4].max() < 0.5
+            assert (quotient >= J[:, j].real - 1e-5).all()
+            assert (quotient <= J[:, j].imag + 1e-5).all()
+    assert (J.imag - J.real)[:4, :4].max() < 0.5
 
 
 def test_the_terminal_set_shrinks_from_sample_to_sample() -> None:
@@ -265,18 +274,19 @@ def test_the_terminal_set_shrinks_from_sample_to_sample() -> None:
     assert not why
     assert margin > 0
     law, back = SlidingModeLaw(RIG, SURFACE, LAW), states(loop)
-    V, middle = np.linalg.inv(loop.W.mean(axis=-1)), loop.W.mean(axis=-1)
+    V, middle = np.linalg.inv(loop.W.real), loop.W.real
     rng = np.random.default_rng(8)
     for mass in (0.11875, 0.125, 0.13125):
         for _ in range(3):
             ball = rng.normal(size=4)
-            z = np.r_[V @ (0.999 * loop.radius[0] * ball / np.linalg.norm(ball)), mass]
-            x = back(z, z)[:, 0].mean(axis=1)
+            z = np.r_[V @ (0.999 * loop.radius.real * ball / np.linalg.norm(ball)), mass]
+            x = back(between(z, z))[:, 0].real
             path = sampled(RIG.with_parameters(m=mass), x, 0.001, 12, law)
             level = []
             for state in path:
                 y = np.r_[state, mass]
-                level.append(np.linalg.norm(middle @ loop.coordinates(y, y)[:4, 0].mean(axis=1)))
+                there = loop.coordinates(between(y, y))[:4, 0].real
+                level.append(np.linalg.norm(middle @ there))
             assert (np.diff(level) < 0).all()
     for radius, period, plant, words in (
         (100, PERIOD, {}, "layer"),
@@ -305,7 +315,7 @@ def test_one_terminal_set_is_found_for_every_damping_within_30_percent() -> None
         z = V @ (0.999 * float(END.radius) / 2 * ball / np.linalg.norm(ball))
         z[2] /= float(scale_of(MODEL)[0])
         point = np.append(z, part * 0.073)
-        x = back(point, point)[:, 0].mean(axis=1)
+        x = back(between(point, point))[:, 0].real
         path = sampled(RIG.with_parameters(d_e=part * 0.073), x, 0.001, 600, law)
         assert np.linalg.norm(path[-1]) < 0.2 * np.linalg.norm(path[0])
 
@@ -336,13 +346,14 @@ def test_a_line_of_starts_converges_at_1_khz_and_the_sentence_says_so() -> None:
         "its input clipped to |voltage| ≤ 15.0 V and held for 0.001 s",
         "the plant the model, no other force",
     ):
-        assert words in found.sentence
+        assert words in sentence(claim(phi=0.01), MODEL)
 
 
 def test_every_plant_of_a_box_converges_and_the_sentence_names_it() -> None:
-    found = decide(MODEL, NUMBERS, claim(plant=within("1/100", "m"), phi=0.002))
+    own = claim(plant=within("1/100", "m"), phi=0.002)
+    found = decide(MODEL, NUMBERS, own)
     assert found.kind == "proved", found.why
-    assert "the plant any with m in [0.12375, 0.12625]" in found.sentence
+    assert "the plant any with m in [0.12375, 0.12625]" in sentence(own, MODEL)
     assert found.details["tubes"] >= 1
 
 
@@ -372,7 +383,7 @@ def test_what_is_false_or_not_shown_is_not_proved() -> None:
 
 def test_cuts_may_be_of_the_plant_too() -> None:
     own = replace(claim(plant=within("1/100", "m"), phi=0.002), cuts={"m": (Fraction(1, 8),)})
-    data = {"kind": own.kind, **own.data()}
+    data = claim_data(own)
     assert read_claim(data, MODEL) == own
     assert decide(MODEL, NUMBERS, own).details["tubes"] == 2
     with pytest.raises(Refused, match="what varies"):
@@ -440,7 +451,7 @@ def test_kept_starts_of_the_sampled_loop_are_proved_from_their_file(
 
 def test_the_terminal_set_of_a_held_input_is_told_in_states() -> None:
     """Near the target W of x is W of (q, P, s), P = (M q̇)_u."""
-    W_x, radius = LoopClaim(claim(phi=0.1).data()).terminal(RIG, SURFACE)
+    W_x, radius = LoopClaim.of(claim(phi=0.1)).terminal(RIG, SURFACE)
     assert radius == float(END.radius)
     for x in 1e-6 * np.random.default_rng(3).normal(size=(4, 4)):
         z = [*x[:2], (RIG.M(x[:2]) @ x[2:])[1], *SlidingModeLaw(RIG, SURFACE)(0.0, x).s]

@@ -144,7 +144,7 @@ def test_the_papers_cases_with_their_loops(monkeypatch: pytest.MonkeyPatch) -> N
     rig = ut.mechanisms.rotary_pendulum(d_e=0.073)
     kept = read_certificate(Path(__file__).parents[1] / "data" / "closed_loop_v2.json")
     stated = kept.subjects[3].claims[0]
-    claim, sound = LoopClaim(stated.claim.data()), Verdict("starts", "proved", 0.68, "rad")
+    claim, sound = LoopClaim.of(stated.claim), Verdict("starts", "proved", 0.68, "rad")
     reaches: list[float] = []
 
     def prove(asked: decide._Decisions, hold: int, seconds: float) -> tuple[LoopClaim, Verdict]:

@@ -177,7 +177,7 @@ def _files(
             key = "region" if len(certified) == 1 else f"region_{index + 1}"
             figures[key] = certification.region_figure(item.region, item.subject.reaching, title)
         for claim in (c for c in item.subject.claims if c.kind == "closed loop"):
-            found, subject = LoopClaim(claim.claim.data()), item.subject
+            found, subject = LoopClaim.of(claim.claim), item.subject
             key = "loop" if len(certified) == 1 else f"loop_{index + 1}"
             figures[key] = certification.loop_figure(
                 mechanism, subject.surface, subject.reaching, found, title

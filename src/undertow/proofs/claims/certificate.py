@@ -19,6 +19,7 @@ from undertow.base.verdict import Verdict
 from undertow.law import ReachingLaw, Surface
 from undertow.models.mechanism import Mechanism
 from undertow.proofs.claims.document import document_bytes, law_objects, read_document
+from undertow.proofs.claims.words import sentence
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.reader import LARGEST, Document
 
@@ -143,7 +144,7 @@ class Certificate:
         for subject in document.subjects:
             known = [kernel.read_claim(data, document.model) for data in subject.claims]
             stated = (
-                StatedClaim(c, Verdict(c.sentence(document.model), "undecided")) for c in known
+                StatedClaim(c, Verdict(sentence(c, document.model), "undecided")) for c in known
             )
             subjects.append(Subject(*law_objects(subject.law), tuple(stated)))
         return cls(document.model.name, tuple(subjects), content, document)

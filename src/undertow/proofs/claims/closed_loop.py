@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any, cast
+from typing import Any, Self, cast
 
 import numpy as np
 
@@ -15,6 +15,8 @@ from undertow.law import ProvedSet, ReachingLaw, Surface
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.claim import Claim
 from undertow.proofs.claims.model_data import law_of, model_of
+from undertow.proofs.claims.words import sentence
+from undertow.proofs.claims.written import claim_data
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.model import Model
 
@@ -30,6 +32,11 @@ class LoopClaim(Claim):
     """
 
     data: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, claim: kernel.Claim) -> Self:
+        """Return the claim that a certificate states."""
+        return cls(claim_data(claim))
 
     def decide(self, mechanism: Mechanism, surface: Surface, law: ReachingLaw) -> Verdict:
         """Let the kernel decide it; the margin is the largest start of the first state that varies.
@@ -48,7 +55,7 @@ class LoopClaim(Claim):
             margin = float(min(abs(v) for v in own.starts[varied[0]]))
             unit = mechanism.coordinates[model.states.index(varied[0]) % mechanism.n].unit
         return Verdict(
-            answer.sentence, kind, margin, unit, answer.witness, answer.why, answer.details
+            sentence(own, model), kind, margin, unit, answer.witness, answer.why, answer.details
         )
 
     def stated(self, mechanism: Mechanism, verdict: Verdict) -> kernel.Claim:

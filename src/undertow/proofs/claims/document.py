@@ -12,6 +12,8 @@ from undertow.base.verdict import Kind, Verdict
 from undertow.law import ReachingLaw, Surface
 from undertow.models.mechanism import Mechanism
 from undertow.proofs.claims.model_data import law_data, model_data
+from undertow.proofs.claims.words import sentence
+from undertow.proofs.claims.written import claim_data
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.model import Law
 from undertow.proofs.kernel.reader import FORMAT, VERSION, Document, Refused, digest, read
@@ -38,7 +40,7 @@ def document_bytes(
         "subjects": [
             {
                 "law": law_data(mechanism, surface, law),
-                "claims": [{"kind": claim.kind, **claim.data()} for claim in claims],
+                "claims": [claim_data(claim) for claim in claims],
             }
             for surface, law, claims in subjects
         ],
@@ -101,7 +103,8 @@ def decide_document(
     document: Document, progress: Callable[[str, float], None] | None = None
 ) -> list[tuple[Law, kernel.Claim, Verdict]]:
     """Decide all claims of a file: from the file alone."""
-    return [
-        (law, claim, Verdict(d.sentence, cast(Kind, d.kind), witness=d.witness, method=d.why))
-        for law, claim, d in kernel.check(document, progress)
-    ]
+    decided = []
+    for law, claim, answer in kernel.check(document, progress):
+        said, kind = sentence(claim, document.model), cast(Kind, answer.kind)
+        decided.append((law, claim, Verdict(said, kind, witness=answer.witness, method=answer.why)))
+    return decided

@@ -18,6 +18,7 @@ from undertow.law import ReachingLaw, Surface, check_surface_shape
 from undertow.models.mechanism import Mechanism
 from undertow.proofs.claims.claim import Box, Claim
 from undertow.proofs.claims.model_data import law_of, model_of
+from undertow.proofs.claims.words import sentence
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.require import require
 
@@ -129,11 +130,12 @@ def nonsingular(
     margin = next(whole, 0.0)
     if not margin and decide(TINY).kind == "proved":
         margin = largest(decide, 0.5, tolerance, 1.0).proved or TINY
-    found = decide(margin or TINY)
+    found, claim = decide(margin or TINY), kernel.Nonsingular(box, Fraction(margin or TINY))
     proved = found.kind == "proved"
     why = f"{found.why}, gave up" if found.kind == "undecided" else found.why
     least = margin if proved else math.nan
-    return Verdict(found.sentence, cast(Kind, found.kind), least, "", found.witness, why)
+    said = sentence(claim, model)
+    return Verdict(said, cast(Kind, found.kind), least, "", found.witness, why)
 
 
 def singular_distance(

@@ -32,6 +32,7 @@ from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.claim import Box, Claim
 from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.claims.nonsingular import Largest, exact_region, largest, nonsingular
+from undertow.proofs.claims.words import sentence
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.model import Law, Model
 
@@ -147,7 +148,7 @@ def reaching(
     exists = nonsingular(mechanism, surface, region, max_boxes=max_boxes)
     if not exists:
         why = f"the law is not shown to exist there: {exists.method}"
-        verdict = replace(exists, claim=condition.decide(bounds, rate).sentence, method=why)
+        verdict = replace(exists, claim=condition.sentence(bounds, rate), method=why)
         none = [condition.bound(j, 0.0, 0.0, {}) for j in range(mechanism.n)]
         return ReachingCertificate(verdict, tuple(none), 0.0)
     verdict = condition.verdict(bounds, rate)
@@ -219,10 +220,17 @@ class _Condition:
         law = self.law
         if more:
             law = replace(law, eta=tuple(k + Fraction(more) for k in law.eta))
-        claim = kernel.Reaching(
-            self.region, tuple(map(Fraction, bounds)), tuple(map(Fraction, rate))
-        )
-        return kernel.decide(self.model, law, claim, self.max_boxes)
+        return kernel.decide(self.model, law, self._stated(bounds, rate), self.max_boxes)
+
+    def sentence(self, bounds: Sequence[float], rate: Sequence[float]) -> str:
+        """Return it in words."""
+        return sentence(self._stated(bounds, rate), self.model)
+
+    def _stated(
+        self, bounds: Sequence[float] | FloatArray, rate: Sequence[float]
+    ) -> kernel.Reaching:
+        loads, rates = (tuple(map(Fraction, v)) for v in (bounds, rate))
+        return kernel.Reaching(self.region, loads, rates)
 
     def largest(self, load: FloatArray, rate: Sequence[float]) -> Largest:
         """Return the largest factor on a load that is overcome."""
@@ -253,7 +261,8 @@ class _Condition:
             if short.proved and short.failed and short.failed.kind == found.kind:
                 found = replace(found, witness=short.failed.witness)
         kind = cast(Kind, found.kind)
-        return Verdict(found.sentence, kind, margin, "1/s", found.witness, found.why)
+        said = self.sentence(bounds, rate)
+        return Verdict(said, kind, margin, "1/s", found.witness, found.why)
 
     def alone(self, j: int, rate: Sequence[float]) -> DisturbanceBound:
         """What is overcome of a disturbance on coordinate j alone."""

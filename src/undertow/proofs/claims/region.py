@@ -18,6 +18,8 @@ from undertow.law import ReachingLaw, Surface
 from undertow.models.mechanism import Mechanism
 from undertow.proofs.claims.claim import Box, Claim
 from undertow.proofs.claims.model_data import law_of, model_of
+from undertow.proofs.claims.words import sentence
+from undertow.proofs.claims.written import claim_data
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.model import Matrix
 from undertow.proofs.kernel.region import Function, Stage, Stretch, on_the_line
@@ -47,12 +49,12 @@ class RegionClaim(Claim):
     def decide(self, mechanism: Mechanism, surface: Surface, law: ReachingLaw) -> Verdict:
         """Let the kernel decide it; the margin is the start's distance from 0."""
         model = model_of(mechanism)
-        own = kernel.read_claim({"kind": kernel.SurfaceRegion.kind, **self._own().data()}, model)
+        own = kernel.read_claim(claim_data(self._own()), model)
         answer = kernel.decide(model, law_of(mechanism, surface, law), own)
         kind, margin = cast(Kind, answer.kind), float(np.linalg.norm(self.start)) * (1 - 1e-12)
         unit = mechanism.coordinates[mechanism.m].unit
         return Verdict(
-            answer.sentence, kind, margin if kind == "proved" else float("nan"), unit,
+            sentence(own, model), kind, margin if kind == "proved" else float("nan"), unit,
             answer.witness, answer.why, answer.details,
         )  # fmt: skip
 

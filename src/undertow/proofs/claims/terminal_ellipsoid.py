@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
-from typing import Self, cast
+from typing import Any, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,8 +27,9 @@ from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.claim import Claim
 from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.kernel import claims as kernel
-from undertow.proofs.kernel.graph import Span
-from undertow.proofs.kernel.model import System
+from undertow.proofs.kernel.compiled import between
+from undertow.proofs.kernel.graph import Graph, Intervals, Span
+from undertow.proofs.kernel.model import Law, System
 from undertow.proofs.require import require, require_autonomous
 
 
@@ -138,9 +139,14 @@ class ClosedLoopProgram:
 
     def __init__(self, mechanism: Mechanism, switching: str = "saturation") -> None:
         model = model_of(mechanism)
+        self.n, self.m = n, m = model.n, model.m
         bounds = tuple(Fraction(float(v)) for v in mechanism.disturbance_bounds)
-        own = System(model, None, switching, bounds)
-        self.n, self.m = model.n, model.m
+        fixed, layout = 2 * n + len(model.parameters), LawLayout(n, m)
+        graph = Graph(fixed + layout.reaching.stop)
+        numbers = graph.inputs[fixed:]
+        parts = *layout.blocks(numbers), numbers[layout.eta], numbers[layout.layer]
+        law = Law(*cast(Any, (*parts, switching, bounds)))
+        own = System(model, law, graph=graph, leaves=graph.inputs[:fixed])
         self.program = kernel.ellipsoid_program(own)
         self.own = own
 
@@ -181,16 +187,17 @@ class ClosedLoopProgram:
         values = [Span(0)] * (2 * self.n) + [
             Span(Fraction(float(v))) for v in mechanism.parameter_values
         ]
-        return kernel.no_equilibrium(self.own, values) is None
+        return not self.own.graph.not_zero(self.own.f[self.m :], values, "f_u(0, 0) = 0")
 
     def over(self, low: FloatArray, high: FloatArray, variables: int = 0) -> FloatArray:
         """Enclose the outputs over a box of inputs, (O, 1 + variables, 2)."""
-        return self.program(low, high, variables)
+        found = self.program(between(low, high), variables)
+        return np.stack([found.real, found.imag], axis=-1)
 
     def at_target(self, numbers: FloatArray) -> FloatArray:
         """Return enclosures of the outputs and of their gradients at x = 0, (O, 1 + 2n, 2)."""
         point = np.concatenate([np.zeros(2 * self.n), numbers])
-        return self.program(point, point, 2 * self.n)
+        return self.over(point, point, 2 * self.n)
 
 
 class _ByStructure:
@@ -219,15 +226,11 @@ def prove(
     rows: tuple[FloatArray, FloatArray],
     limits: FloatArray,
     found: TerminalEllipsoid,
-    centre: FloatArray | None = None,
+    centre: Intervals | None = None,
 ) -> tuple[int, float, FloatArray]:
     """Run the kernel's rule: the index of what is not shown, the margin, the box's half-sides."""
-
-    def points(values: FloatArray) -> FloatArray:
-        return np.stack([values, values], axis=-1)
-
-    C, layer = rows
+    (C, layer), W = rows, found.W
     return kernel.ellipsoid(
-        loop.program, points(numbers), points(found.W), found.radius, points(C), layer, limits,
-        centre,
+        loop.program, between(numbers, numbers), between(W, W), found.radius, between(C, C), layer,
+        limits, centre,
     )  # fmt: skip

@@ -207,5 +207,5 @@ def _proved_set(mechanism: Mechanism, subject: Subject, claim: kernel.Claim) -> 
     if isinstance(claim, kernel.TerminalEllipsoid):
         return TerminalEllipsoid.of(claim).proved_set(*law)
     if isinstance(claim, kernel.ClosedLoop):
-        return LoopClaim(claim.data()).proved_set(*law)
+        return LoopClaim.of(claim).proved_set(*law)
     return None

@@ -9,5 +9,5 @@ compiler; no other part of Undertow, no SymPy and no search is imported (a contr
 coefficients) and the Taylor step.  ``graph``: expressions, exact or lowered to code.  ``model``:
 M, f, B and the law of a file, and the closed loop that is made of them.  ``reader``: the file.
 ``bound``: branch and bound.  ``region``: sets on the surface.  ``tube``: validated integration.
-``loop``: the closed loop, continuous or held.  ``claims``: the rules, ``words`` their sentences.
+``loop``: the closed loop, continuous or held.  ``claims``: the rules.
 """

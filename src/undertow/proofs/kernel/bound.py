@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from undertow.proofs.kernel import compiled as ops
-from undertow.proofs.kernel.graph import FloatArray, Program, hull
+from undertow.proofs.kernel.graph import FloatArray, Intervals, Program
 
 #: Boxes that are looked at together, and points of them that are tried for a counterexample.
 CHUNK, TRIED = 512, 16
@@ -23,7 +23,7 @@ class Goal:
 
     what: str
     sign: int = 1
-    bound: tuple[float, float] = (0.0, 0.0)
+    bound: complex = complex(0.0, 0.0)
     strict: bool = True
 
 
@@ -38,25 +38,19 @@ class Settled:
 
 
 def over_boxes(
-    program: Program, low: FloatArray, high: FloatArray, fixed: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Enclose outputs over boxes (V, N) with fixed inputs (F, 2): (O, 2, N), (O, V, N).
+    program: Program, low: FloatArray, high: FloatArray, fixed: Intervals
+) -> tuple[Intervals, FloatArray]:
+    """Enclose outputs over boxes (V, N) with fixed inputs (F,): (O, N), (O, V, N).
 
     The second is how much each output varies with each variable: a guess for splitting.
     """
     V, boxes = low.shape
-    values = np.empty((len(program.outputs), 2, boxes))
+    values = np.empty((len(program.outputs), boxes), dtype=complex)
     spreads = np.empty((len(program.outputs), V, boxes))
-    a, b = np.empty((2, V + len(fixed)))
-    a[V:], b[V:] = fixed.T
-    m, top = a.copy(), b.copy()
     for k in range(boxes):
-        a[:V], b[:V] = low[:, k], high[:, k]
-        m[:V] = top[:V] = 0.5 * a[:V] + 0.5 * b[:V]
-        whole, centre = program(a, b, V), program(m, top)
-        values[:, :, k], spreads[:, :, k] = ops.mean_values(
-            whole, centre[:, 0], a[:V], b[:V], m[:V]
-        )
+        box, m = ops.between(low[:, k], high[:, k]), 0.5 * low[:, k] + 0.5 * high[:, k]
+        whole, centre = program.expanded(box, m, fixed)
+        values[:, k], spreads[:, :, k] = ops.mean_values(whole, centre, box, m)
     return values, spreads
 
 
@@ -72,7 +66,7 @@ def halved(
 def settle(
     program: Program,
     box: Sequence[tuple[Fraction, Fraction]],
-    fixed: FloatArray,
+    fixed: Intervals,
     goals: Sequence[Goal],
     max_boxes: int,
 ) -> Settled:
@@ -85,11 +79,11 @@ def settle(
     box
         (low, high) of the first V inputs.
     fixed
-        Enclosures of the others, (F, 2).
+        Enclosures of the others, (F,).
     """
-    ends = np.array([hull(a, b) for a, b in box])
+    ends = ops.ends(box)
     low, high = ends[:, :1], ends[:, 1:]
-    corners = np.array(list(itertools.product(*ends[:10]))).T if len(box) <= 10 else low
+    corners = np.array(list(itertools.product(*ends))).T if len(box) <= 10 else low
     count = 0
     signs = np.array([g.sign for g in goals])
 
@@ -98,11 +92,11 @@ def settle(
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], FloatArray]:
         """Goals that are not shown, and that are shown false, (O, N), with spreads."""
         values, spread = over_boxes(program, a, b, fixed)
-        below = np.where(signs[:, None] > 0, values[:, 0], -values[:, 1])
-        above = np.where(signs[:, None] > 0, values[:, 1], -values[:, 0])
+        below = np.where(signs[:, None] > 0, values.real, -values.imag)
+        above = np.where(signs[:, None] > 0, values.imag, -values.real)
         shown, wrong = np.empty(below.shape, bool), np.empty(below.shape, bool)
         for k, goal in enumerate(goals):
-            start, end = goal.bound
+            start, end = goal.bound.real, goal.bound.imag
             shown[k] = below[k] > end if goal.strict else below[k] >= end
             wrong[k] = above[k] <= start if goal.strict else above[k] < start
         return ~shown, wrong, spread

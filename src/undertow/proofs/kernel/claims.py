@@ -1,4 +1,4 @@
-"""The rules: each kind of claim with its statement, its decision and its sentence.
+"""The rules: each kind of claim with its statement and its decision.
 
 Statements and lemmas are those of ``docs/certificate-format.md``, section 5, under the same names.
 """
@@ -17,17 +17,26 @@ import numpy as np
 
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.bound import Goal, settle
-from undertow.proofs.kernel.graph import FloatArray, Graph, Program, Span, hull
+from undertow.proofs.kernel.graph import (
+    Array,
+    FloatArray,
+    Graph,
+    Intervals,
+    Node,
+    Program,
+    Span,
+)
 from undertow.proofs.kernel.loop import ContinuousLoop, HeldLoop, Loop
 from undertow.proofs.kernel.model import (
-    Algebra,
     Law,
     Matrix,
     Model,
-    Quantity,
     Sliding,
     System,
+    characteristic,
+    identity,
     input_limits,
+    solve,
     system,
 )
 from undertow.proofs.kernel.reader import (
@@ -36,16 +45,12 @@ from undertow.proofs.kernel.reader import (
     interval,
     matrix,
     number,
-    number_text,
     numbers,
     require,
 )
 from undertow.proofs.kernel.region import Function, Stage, Stretch, on_the_line
-from undertow.proofs.kernel.words import Region, inward, limits, region, within
 
-__all__ = ["KINDS", "Claim", "ClosedLoop", "Decision", "Nonsingular", "Reaching", "Stability",
-           "SurfaceRegion", "TerminalEllipsoid", "check", "decide", "ellipsoid",
-           "ellipsoid_program", "no_equilibrium", "read_claim"]  # fmt: skip
+Region = Mapping[str, tuple[Fraction, Fraction]]
 
 #: Boxes of a branch and bound before it gives up.
 MOST_BOXES = 200_000
@@ -55,19 +60,13 @@ MOST_BOXES = 200_000
 class Decision:
     """What the checker says of one claim: ``proved``, ``refuted`` or ``undecided``, and why.
 
-    ``sentence`` is the statement, in words made of the claim's numbers; ``witness`` the point
-    where a refuted claim is false, or where the checker gave up.
+    ``witness`` is the point where a refuted claim is false, or where the checker gave up.
     """
 
     kind: str
-    sentence: str
     why: str
     witness: Mapping[str, float] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)
-
-
-#: Kind of verdict, why, witness, details.
-Found = tuple[str, str, dict[str, float], dict[str, Any]]
 
 
 class Claim(ABC):
@@ -82,39 +81,11 @@ class Claim(ABC):
         """Read it from an object with its keys."""
 
     @abstractmethod
-    def data(self) -> dict[str, Any]:
-        """Return the object that :meth:`read` reads."""
-
-    @abstractmethod
-    def sentence(self, model: Model) -> str:
-        """Return the statement in words."""
-
-    @abstractmethod
-    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Decision:
         """Decide the statement."""
 
 
-def _texts(values: Any) -> Any:
-    return [_texts(v) for v in values] if isinstance(values, tuple) else number_text(values)
-
-
 # -- linear algebra on exact numbers --------------------------------------------------------------
-
-Spans = list[list[Span]]
-
-
-def _characteristic(A: Spans) -> list[Span]:
-    """Coefficients of det(x − A), highest power first (Faddeev and LeVerrier)."""
-    n, out = len(A), [Span(1)]
-    N = [[Span(int(i == j)) for j in range(n)] for i in range(n)]
-    for k in range(1, n + 1):
-        step = [[sum((a * r[j] for a, r in zip(row, N, strict=True)), Span(0)) for j in range(n)]
-                for row in A]  # fmt: skip
-        trace = sum((step[i][i] for i in range(n)), Span(0))
-        out.append(trace * Span(Fraction(-1, k)))
-        N = [[v + out[-1] if i == j else v for j, v in enumerate(row)]
-             for i, row in enumerate(step)]  # fmt: skip
-    return out
 
 
 def _routh(coefficients: list[Span]) -> bool | None:
@@ -127,17 +98,6 @@ def _routh(coefficients: list[Span]) -> bool | None:
         padded = second + [Span(0)] * (len(first) - len(second))
         third = [first[i + 1] - factor * padded[i + 1] for i in range(len(first) - 1)]
         first, second = second, third
-    return True
-
-
-def _positive(A: list[list[Fraction]]) -> bool:
-    """Whether a symmetric rational matrix is positive definite, by its pivots."""
-    for j, row in enumerate(A):
-        if row[j] <= 0:
-            return False
-        for i in range(j + 1, len(A)):
-            factor = A[i][j] / row[j]
-            A[i] = [a - factor * b for a, b in zip(A[i], row, strict=True)]
     return True
 
 
@@ -159,60 +119,45 @@ class Stability(Claim):
         require(rate >= 0, "a rate ≥ 0")
         return cls(rate)
 
-    def data(self) -> dict[str, Any]:
-        """Return the object that :meth:`read` reads."""
-        return {"rate": number_text(self.rate)}
-
-    def sentence(self, model: Model) -> str:
-        """Return the statement in words."""
-        return (
-            "motions on the surface near the target converge to it exponentially, at a rate of at "
-            f"least {inward(self.rate)} 1/s; how near is not said, and the input is not limited"
-        )
-
-    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Decision:
         """Decide the statement."""
         matrix = _sliding_matrix(model, law)
-        if isinstance(matrix, tuple):
-            return *matrix, {}, {}
-        rate = Span(self.rate)
-        shifted = [[v + rate if i == j else v for j, v in enumerate(row)]
-                   for i, row in enumerate(matrix)]  # fmt: skip
-        exact = all(v.exact for row in matrix for v in row)
+        if isinstance(matrix, Decision):
+            return matrix
+        exact = all(v.exact for v in matrix.flat)
         method = f"Routh array in {'exact rationals' if exact else 'rational intervals'}"
-        stable = _routh(_characteristic(shifted))
-        return {True: "proved", False: "refuted", None: "undecided"}[stable], method, {}, {}
+        diagonal = np.diag_indices(len(matrix))
+        matrix[diagonal] = matrix[diagonal] + Span(self.rate)
+        stable = _routh(characteristic(matrix, Span)[0])
+        return Decision({True: "proved", False: "refuted", None: "undecided"}[stable], method)
 
 
-def _sliding_matrix(model: Model, law: Law) -> Spans | tuple[str, str]:
+def _sliding_matrix(model: Model, law: Law) -> Array | Decision:
     """Return A of ż = A z, z = (q_a, q_u, v_u), or a verdict and why there is none."""
     n, m, size = model.n, model.m, 2 * model.n - model.m
     graph = Graph(size)
-    algebra, z = Algebra(graph), [[k] for k in graph.inputs]
-    blocks = ((law.lambda_a, z[:m]), (law.lambda_u, z[m:n]))
-    held, free = (
-        algebra.times([[graph.number(v) for v in row] for row in A], q) for A, q in blocks
-    )
+    q, v_u = np.split(graph.inputs, [n])
+    pull = graph.numbers(law.lambda_a) @ q[:m] + graph.numbers(law.lambda_u) @ q[m:]
     own = [graph.number(p.value or 0) for p in model.parameters]
-    on = Sliding.of(algebra, model, law, z[:n], algebra.each("add", held, free), z[n:], own)
-    rates, at = [row[0] for row in (*on.v_a, *z[n:], *on.v_u_dot)], [Span(0)] * size
+    on = Sliding.of(graph, model, law, q, pull, v_u, own)
+    rates, at = [*on.v_a, *v_u, *on.v_u_dot], [Span(0)] * size
     none = "det(M_uu − M_ua α_a⁻¹ α_u) = 0 at the target, or det α_a = 0: no sliding dynamics"
     try:
         if not all(v.low > 0 for v in graph.exact(on.pivots, at)):
-            return "undecided", "M is not shown to be positive definite at the target"
+            return Decision("undecided", "M is not shown to be positive definite at the target")
         for k in on.determinants:
             (value,) = graph.exact([k], at)
             if value.zero:
-                return "refuted", none
+                return Decision("refuted", none)
             if not _sign(value):
-                return "undecided", f"not excluded: {none}"
+                return Decision("undecided", f"not excluded: {none}")
         values, one = graph.exact(rates, at), graph.number(1)
         slopes = [graph.exact(graph.tangents(rates, {k: one}), at) for k in graph.inputs]
     except ArithmeticError as error:
-        return "undecided", f"at the target: {error}"
+        return Decision("undecided", f"at the target: {error}")
     if not all(v.zero for v in values):
-        return "undecided", "f_u(0, 0) = 0 is not shown exactly"
-    return [list(row) for row in zip(*slopes, strict=True)]
+        return Decision("undecided", "f_u(0, 0) = 0 is not shown exactly")
+    return np.array(slopes, dtype=object).T
 
 
 # -- 5.2, 5.3 -------------------------------------------------------------------------------------
@@ -235,15 +180,11 @@ def _read_region(data: Any, model: Model) -> dict[str, Any]:
     return _read_box(data, {p.name: Fraction(0) for p in model.positions})
 
 
-def _box_data(box: Region) -> dict[str, Any]:
-    return {k: [number_text(v) for v in ends] for k, ends in box.items()}
-
-
 def _sign(value: Span) -> int:
     return 1 if value.low > 0 else -1 if value.high < 0 else 0
 
 
-def _regular(own: System) -> tuple[list[int], list[Goal], Span] | str:
+def _regular(own: System) -> tuple[list[Node], list[Goal], Span] | str:
     """Nodes and goals of regularity, and det Γ(0); or why the target itself is not regular."""
     try:
         at = own.graph.exact([own.B_determinant, own.gamma_determinant], own.origin())
@@ -254,16 +195,16 @@ def _regular(own: System) -> tuple[list[int], list[Goal], Span] | str:
         return "det B or det Γ may be 0 at the target"
     goals = [Goal(f"pivot {k + 1} of M is > 0") for k in range(own.model.n)]
     goals += [Goal("det B keeps its sign", _sign(drive)), Goal("Γ is non-singular", _sign(gamma))]
-    return [*own.pivots, own.B_determinant, own.gamma_determinant], goals, gamma
+    return own.regular, goals, gamma
 
 
 def _over_region(
-    own: System, box: Region, nodes: Sequence[int], goals: Sequence[Goal], max_boxes: int
-) -> Found:
+    own: System, box: Region, nodes: Sequence[Node], goals: Sequence[Goal], max_boxes: int
+) -> Decision:
     n = own.model.n
     zero = (Fraction(0), Fraction(0))
     ends = [box.get(p.name, zero) for p in own.model.positions]
-    fixed = np.vstack([np.zeros((n, 2)), own.fixed()])
+    fixed = np.concatenate([np.zeros(n), own.fixed()])
     found = settle(own.graph.program(nodes), ends, fixed, goals, max_boxes)
     method = "intervals and mean values, branch and bound"
     why = method if found.kind == "proved" else f"{method}: {found.why}, not shown"
@@ -271,7 +212,7 @@ def _over_region(
     witness = dict(zip(names, found.point, strict=False))
     if found.kind == "refuted":
         why = f"{method}; false: {found.why}"
-    return found.kind, why, witness, {"boxes": found.boxes}
+    return Decision(found.kind, why, witness, {"boxes": found.boxes})
 
 
 @dataclass(frozen=True)
@@ -290,28 +231,16 @@ class Nonsingular(Claim):
         require(ratio > 0, "a ratio > 0")
         return cls(_read_region(data["region"], model), ratio)
 
-    def data(self) -> dict[str, Any]:
-        """Return the object that :meth:`read` reads."""
-        return {"region": _box_data(self.region), "ratio": number_text(self.ratio)}
-
-    def sentence(self, model: Model) -> str:
-        """Return the statement in words."""
-        where = region(model.positions, self.region)
-        return (
-            f"the law exists {where}: M is positive definite, B and α_a − α_u M_uu⁻¹ M_auᵀ are "
-            f"non-singular, whose determinant keeps {inward(self.ratio)} of that at the target"
-        )
-
-    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Decision:
         """Decide the statement."""
         own = system(model, law)
         regular = _regular(own)
         if isinstance(regular, str):
-            return "undecided", regular, {}, {}
+            return Decision("undecided", regular)
         nodes, goals, gamma = regular
         least = gamma * Span(_sign(gamma) * self.ratio)
         bound = Goal(
-            "det Γ/det Γ(0) is as stated", _sign(gamma), hull(least.low, least.high), False
+            "det Γ/det Γ(0) is as stated", _sign(gamma), ops.hull(least.low, least.high), False
         )
         return _over_region(own, self.region, [*nodes, nodes[-1]], [*goals, bound], max_boxes)
 
@@ -333,51 +262,26 @@ class Reaching(Claim):
         require(min(*bounds, *rate) >= 0, "disturbances and rates ≥ 0")
         return cls(_read_region(data["region"], model), bounds, rate)
 
-    def data(self) -> dict[str, Any]:
-        """Return the object that :meth:`read` reads."""
-        numbers = {"disturbance": _texts(self.disturbance), "rate": _texts(self.rate)}
-        return {"region": _box_data(self.region), **numbers}
-
-    def sentence(self, model: Model) -> str:
-        """Return the statement in words."""
-        loads = ", ".join(
-            f"{p.name}: {inward(v)} {'N m' if p.unit == 'rad' else 'N'}"
-            for p, v in zip(model.positions, self.disturbance, strict=True)
-            if v
-        )
-        what = (
-            f"overcomes every disturbance on {loads} at most," if loads else "reaches the surface"
-        )
-        rates = ", ".join(inward(v) for v in self.rate)
-        return (
-            f"the law {what} {region(model.positions, self.region)}: (16) with η = {rates}, "
-            "wherever |s_i| ≥ ε_i, the inputs not limited; motions that leave these positions are "
-            "not covered"
-        )
-
-    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Decision:
         """Decide the statement."""
         if law.switching == "tanh":
-            return "undecided", "tanh is less than 1 everywhere: (16) is not stated of it", {}, {}
+            return Decision("undecided", "tanh is less than 1 everywhere: (16) is not stated of it")
         own = system(model, law)
         regular = _regular(own)
         if isinstance(regular, str):
-            return "undecided", regular, {}, {}
+            return Decision("undecided", regular)
         nodes, goals, _ = regular
-        graph, algebra, n, m = own.graph, own.algebra, model.n, model.m
-        one = [[graph.number(int(i == j)) for j in range(n)] for i in range(n)]
-        identity = [row[:m] for row in one[:m]]
-        actuated = algebra.times(own.gamma, algebra.solve(own.ss, identity))
-        rest = algebra.each("sub", own.alpha_u, algebra.times(actuated, own.M_au))
-        free = algebra.times(rest, algebra.solve(own.uu, [row[m:] for row in one[m:]]))
+        number, m = own.graph.number, model.m
+        actuated = own.gamma @ solve(own.ss, identity(m, number))
+        rest = own.alpha_u - actuated @ own.M_au
+        free = rest @ solve(own.uu, identity(model.n - m, number))
         for i in range(m):
-            left = graph.make("sub", own.gains[i], graph.number(self.rate[i]))
+            left = own.gains[i] - number(self.rate[i])
             for weight, bound in zip([*actuated[i], *free[i]], self.disturbance, strict=True):
-                load = graph.make("mul", graph.make("abs", weight), graph.number(bound))
-                left = graph.make("sub", left, load)
-            if (known := graph.value(left)) is not None:
+                left = left - abs(weight) * bound
+            if (known := left.number) is not None:
                 if known < 0:
-                    return "refuted", f"k_{i + 1} − η̃_{i + 1} = {float(known):.4g} < 0", {}, {}
+                    return Decision("refuted", f"k_{i + 1} − η̃_{i + 1} = {float(known):.4g} < 0")
             else:
                 nodes = [*nodes, left]
                 goals = [*goals, Goal(f"row {i + 1} of (16)", strict=False)]
@@ -394,8 +298,8 @@ REASONS = (
 
 
 def ellipsoid(
-    program: Program, fixed: FloatArray, W: FloatArray, radius: float, C: FloatArray,
-    layer: FloatArray, limits: FloatArray, centre: FloatArray | None = None,
+    program: Program, fixed: Intervals, W: Intervals, radius: float, C: Intervals,
+    layer: FloatArray, limits: FloatArray, centre: Intervals | None = None,
 ) -> tuple[int, float, FloatArray]:  # fmt: skip
     """Decide Lemma 5, as ``compiled.ellipsoid`` says: code, margin, half-sides of Q.
 
@@ -406,10 +310,9 @@ def ellipsoid(
     half = np.array([ops.up(ops.norm(row) * radius) for row in V])
     if not (np.isfinite(V).all() and np.isfinite(half).all()):
         return 1, -math.inf, np.zeros(size)
-    low, high = np.vstack([np.zeros((size, 2)), fixed]).T.copy()
-    centre = program(low, high)[:, 0] if centre is None else centre
-    low[:size], high[:size] = -half, half
-    whole = program(low, high, size)
+    if centre is None:
+        centre = program(np.concatenate([np.zeros(size), fixed]))[:, 0]
+    whole = program(np.concatenate([ops.between(-half, half), fixed]), size)
     if np.isnan(whole).any():  # something is undefined in Q
         return 2, -math.inf, half
     code, margin = ops.ellipsoid(V, whole, centre, W, radius, C, layer, limits)
@@ -438,69 +341,28 @@ class TerminalEllipsoid(Claim):
         require(radius > 0, "a radius > 0")
         return cls(matrix(data["W"], 2 * model.n, 2 * model.n), radius)
 
-    def data(self) -> dict[str, Any]:
-        """Return the object that :meth:`read` reads."""
-        return {"W": _texts(self.W), "radius": number_text(self.radius)}
-
-    @property
-    def ball(self) -> float:
-        """A radius of a ball ‖x‖ ≤ r inside: ρ/c where c² − WᵀW is shown positive definite."""
-        size = float(np.linalg.norm(np.array(self.W, dtype=float), 2))
-        for slack in (1e-12, 1e-6, 1.0):
-            c = Fraction(size * (1 + slack))
-            columns = list(zip(*self.W, strict=True))
-            rest = [
-                [c * c * int(i == j) - sum(a * b for a, b in zip(p, q, strict=True))
-                 for j, q in enumerate(columns)]
-                for i, p in enumerate(columns)
-            ]  # fmt: skip
-            if _positive(rest):
-                return float(self.radius / c) * (1 - 1e-15)
-        return 0.0
-
-    def sentence(self, model: Model) -> str:
-        """Return the statement in words."""
-        ball = inward(Fraction(self.ball), 3)
-        return (
-            "every motion of the full closed loop, its input renewed at every instant and the "
-            f"plant the model, from {{|W x| ≤ ρ}}, which holds the ball ‖x‖ ≤ {ball}, "
-            f"stays there and converges, inside the layer and {limits(model)}"
-        )
-
-    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Decision:
         """Decide the statement."""
         if law.switching == "sign":
-            return "undecided", "with sign(s) there is no layer to be inside of", {}, {}
+            return Decision("undecided", "with sign(s) there is no layer to be inside of")
         own = system(model, law)
-        if (why := no_equilibrium(own)) is not None:
-            return "undecided", why, {}, {}
-        W = np.array([[hull(v, v) for v in row] for row in self.W])
+        if why := own.graph.not_zero(own.f[model.m :], own.origin(), "f_u(0, 0) = 0"):
+            return Decision("undecided", why)  # and if it is, q̈ = 0
         code, margin, half = ellipsoid(
-            ellipsoid_program(own), own.fixed(), W, hull(self.radius, self.radius)[1],
-            _rows(law), np.array([hull(v, v)[0] for v in law.layer]), input_limits(model),
+            ellipsoid_program(own), own.fixed(), ops.hulls(self.W), ops.hull(self.radius).imag,
+            _rows(law), ops.hulls(law.layer).real.copy(), input_limits(model),
         )  # fmt: skip
-        details = {"margin": float(margin), "box": half.tolist(), "ball": self.ball}
+        details = {"margin": float(margin), "box": half.tolist()}
         witness = dict(zip(model.states, half.tolist(), strict=True))
         method = "interval Jacobian over the ellipsoid's box, diagonal dominance"
         if code == 0:
-            return "proved", method, witness, details
-        return "undecided", f"{method}: {REASONS[code]}", witness, details
+            return Decision("proved", method, witness, details)
+        return Decision("undecided", f"{method}: {REASONS[code]}", witness, details)
 
 
-def no_equilibrium(own: System, origin: Sequence[Span] | None = None) -> str | None:
-    """Why the target is not shown to be at rest, or None: f_u(0, 0) = 0 and then q̈ = 0."""
-    try:
-        at = own.origin() if origin is None else origin
-        free = own.graph.exact(own.f[own.model.m :], at)
-    except ArithmeticError as error:
-        return f"at the target: {error}"
-    return None if all(v.zero for v in free) else "f_u(0, 0) = 0 is not shown exactly"
-
-
-def _rows(law: Law) -> FloatArray:
-    """C of s = C x, enclosed, (m, 2n, 2)."""
-    blocks = zip(law.lambda_a, law.lambda_u, law.alpha_a, law.alpha_u, strict=True)
-    return np.array([[hull(v, v) for part in row for v in part] for row in blocks])
+def _rows(law: Law) -> Intervals:
+    """C of s = C x, enclosed, (m, 2n)."""
+    return np.hstack([*map(ops.hulls, (law.lambda_a, law.lambda_u, law.alpha_a, law.alpha_u))])
 
 
 # -- 5.5 ------------------------------------------------------------------------------------------
@@ -558,40 +420,14 @@ class SurfaceRegion(Claim):
         functions = tuple(_function(v, size) for v in listed)
         return cls(stretch, functions, contains, _read_plant(data["plant"], model))
 
-    def data(self) -> dict[str, Any]:
-        """Return the object that :meth:`read` reads."""
-        functions = [
-            {"A": _texts(V.A), "G": _texts(V.G), "exponents": [list(e) for e in V.exponents],
-             "coefficients": _texts(V.coefficients)}
-            for V in self.functions
-        ]  # fmt: skip
-        pole = None if self.stretch.L is None else number_text(self.stretch.L)
-        return {
-            "stretch": _texts(self.stretch.S), "pole": pole, "functions": functions,
-            "contains": _texts(self.contains), "plant": _box_data(self.plant),
-        }  # fmt: skip
-
-    def sentence(self, model: Model) -> str:
-        """Return the statement in words; with one entry the point may be rounded towards 0."""
-        names = _surface_names(model)
-        away = {k: v for k, v in zip(names, self.contains, strict=True) if v}
-        exact = len(away) > 1
-        points = [f"{k} = {float(v)!r}" if exact else f"{k} = {inward(v)}" for k, v in away.items()]
-        ranges = "".join(f", for every {k} in {within(*ends)}" for k, ends in self.plant.items())
-        return (
-            "every motion on the surface from a compact set around the target that contains "
-            f"{', '.join(points) or 'it'} converges to the target{ranges}, non-singular all the "
-            f"way, in the union of {len(self.functions)} such sets; the inputs not limited"
-        )
-
-    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Decision:
         """Decide the statement."""
         names = (
-            *_surface_names(model),
+            *surface_names(model),
             *(p.name for p in model.parameters if p.name in self.plant),
         )
         if len(names) > 8:
-            return "undecided", f"{len(names)} variables; 8 at most", {}, {}
+            return Decision("undecided", f"{len(names)} variables; 8 at most")
         method, boxes = "quadratic Taylor models, branch and bound", 0
         before: Function | None = None
         for k, V in enumerate(self.functions, start=1):
@@ -601,14 +437,14 @@ class SurfaceRegion(Claim):
             if found.kind != "proved":
                 why = f"{method}; function {k}: {found.why}"
                 witness = dict(zip(names, found.point, strict=False))
-                return found.kind, why, witness, {"boxes": boxes, "function": k}
+                return Decision(found.kind, why, witness, {"boxes": boxes, "function": k})
         line = on_the_line(self.stretch, self.functions[-1], self.contains, max_boxes)
         why = method if line.kind == "proved" else f"{method}; {line.why}, not so"
         witness = dict(zip(names, map(float, self.contains), strict=False))
-        return line.kind, why, witness, {"boxes": boxes + line.boxes}
+        return Decision(line.kind, why, witness, {"boxes": boxes + line.boxes})
 
 
-def _surface_names(model: Model) -> tuple[str, ...]:
+def surface_names(model: Model) -> tuple[str, ...]:
     """Names of y = (q_u, v_u, w)."""
     names, m = [p.name for p in model.positions], model.m
     return (*names[m:], *(f"{k}_dot" for k in names[m:]), *(f"w_{k}" for k in names[:m]))
@@ -654,7 +490,7 @@ class ClosedLoop(Claim):
         require(all(isinstance(v, list) for v in cuts.values()), "boxes: lists")
         cuts = {name: numbers(v, len(v)) for name, v in cuts.items()}
         require(math.prod(1 + len(v) for v in cuts.values()) <= 20_000, "at most 20000 boxes")
-        step = number(hint.get("step", number_text(STEP)))
+        step = number(hint["step"]) if "step" in hint else STEP
         require(0 < step <= 1, "a step of 0 to 1 s")
         terminal = hint.get("terminal")
         if terminal is not None:
@@ -662,48 +498,22 @@ class ClosedLoop(Claim):
             terminal = TerminalEllipsoid.read(terminal, model)
         return cls(box, period, plant, bounds, ball, terminal, cuts, step)
 
-    def data(self) -> dict[str, Any]:
-        """Return the object that :meth:`read` reads."""
-        hint = {"step": number_text(self.step)}
-        known = {} if self.terminal is None else {"terminal": self.terminal.data()}
-        known |= {"boxes": {k: _texts(v) for k, v in self.cuts.items()}} if self.cuts else {}
-        return {
-            "starts": _box_data(self.starts), "period": number_text(self.period),
-            "plant": _box_data(self.plant), "disturbance": _texts(self.disturbance),
-            "ball": number_text(self.ball), "hint": {**hint, **known},
-        }  # fmt: skip
-
-    def sentence(self, model: Model) -> str:
-        """Return the statement in words."""
-        rates = [Quantity(f"{p.name}_dot", f"{p.unit}/s") for p in model.positions]
-        starts = region([*model.positions, *rates], self.starts).replace("for ", "with ", 1)
-        end = f"‖x‖ ≤ {inward(self.ball)}" if self.ball else "the target"
-        held = f"held for {float(self.period)!r} s" if self.period else "renewed at every instant"
-        varied = ", ".join(f"{k} in {within(*ends)}" for k, ends in self.plant.items())
-        plant = f"any with {varied}" if varied else "the model"
-        loads = ", ".join(inward(v) for v in self.disturbance)
-        return (
-            f"every motion from starts {starts}, exists for ever and converges to {end}, the law "
-            f"with its layer, its input clipped to {limits(model)} and {held}, the plant {plant}, "
-            f"{f'forces up to {loads}' if any(self.disturbance) else 'no other force'}"
-        )
-
-    def decide(self, model: Model, law: Law, max_boxes: int) -> Found:
+    def decide(self, model: Model, law: Law, max_boxes: int) -> Decision:
         """Decide the statement."""
         if any(self.disturbance) or (self.plant and not self.period):
             why = "forces, and other plants under an input that is not held: not decided here"
-            return "undecided", why, {}, {}
+            return Decision("undecided", why)
         if law.switching != "saturation" or any(law.disturbance) or self.terminal is None:
             why = "saturation, constant gains and a terminal set are needed"
-            return "undecided", why, {}, {}
+            return Decision("undecided", why)
         if 2 * model.n + len(self.plant) > MOST_STATES:
-            return "undecided", f"more than {MOST_STATES} states and parameters that vary", {}, {}
+            return Decision("undecided", f"more than {MOST_STATES} states and parameters that vary")
         try:
             loop = self._loop(model, law, self.terminal)
         except ArithmeticError as error:
-            return "undecided", f"at the target: {error}", {}, {}
+            return Decision("undecided", f"at the target: {error}")
         if isinstance(loop, str):
-            return "undecided", f"the terminal set: {loop}", {}, {}
+            return Decision("undecided", f"the terminal set: {loop}")
         box = {x: self.starts.get(x, (Fraction(0), Fraction(0))) for x in model.states}
         wide = [x for x, (low, high) in box.items() if low < high]
         if wide and system(model, law).odd and all(low == -high for low, high in box.values()):
@@ -712,21 +522,20 @@ class ClosedLoop(Claim):
         pieces = []
         for name, (low, high) in box.items():
             cuts = sorted({v for v in self.cuts.get(name, ()) if low < v < high})
-            pieces.append([hull(*ends) for ends in itertools.pairwise([low, *cuts, high])])
+            pieces.append(ops.ends(itertools.pairwise([low, *cuts, high])))
         end = loop.arrive(np.array([*itertools.product(*pieces)]))
         method = "validated tubes into an ellipsoid that is proved to be a terminal set"
         details = {"tubes": end.tubes, "steps": end.steps, "latest": end.latest}
         if not end.all:
             witness = dict(zip(box, end.lost.tolist(), strict=True))
-            return "undecided", f"{method}: a tube is lost", witness, details
-        return "proved", method, {}, details
+            return Decision("undecided", f"{method}: a tube is lost", witness, details)
+        return Decision("proved", method, details=details)
 
     def _loop(self, model: Model, law: Law, end: TerminalEllipsoid) -> Loop | str:
         """The loop with its terminal set, or what is not shown of that."""
         if not self.period:
-            kind, why, _, _ = end.decide(model, law, 0)
-            own = (model, law, end.W, end.radius, self.step)
-            return why if kind != "proved" else ContinuousLoop(*own)
+            found, own = end.decide(model, law, 0), (model, law, end.W, end.radius, self.step)
+            return found.why if found.kind != "proved" else ContinuousLoop(*own)
         loop = HeldLoop(model, law, self.period, self.plant)
         loop.take(end.W, end.radius)
         return loop.terminal()[0] or loop
@@ -759,8 +568,7 @@ def read_claim(data: Mapping[str, Any], model: Model) -> Claim:
 
 def decide(model: Model, law: Law, claim: Claim, max_boxes: int = MOST_BOXES) -> Decision:
     """Decide a claim about a model and a law."""
-    kind, why, witness, details = claim.decide(model, law, max_boxes)
-    return Decision(kind, claim.sentence(model), why, witness, details)
+    return claim.decide(model, law, max_boxes)
 
 
 def check(

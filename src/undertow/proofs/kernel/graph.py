@@ -1,17 +1,17 @@
 """Expressions as a graph with exact leaves: made, evaluated exactly, lowered to code.
 
-A node is a tuple: a leaf ``("input", i)`` or ``("number", Fraction)`` or ``("pi",)``, or an
-operation with the indices of earlier nodes.  Equal nodes are one.  Numbers are folded exactly, and
-x + 0, x · 1 and the like fall away; 0 · x does only if x is defined everywhere.
+A node is a leaf (an input, a number or π) or an operation on earlier nodes; equal ones are one
+object.  + − × ÷ of nodes are nodes, and so they are of NumPy's arrays of them.  Numbers are folded
+exactly, and x + 0, x · 1 and the like fall away; 0 · x does only if x is defined everywhere.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+import operator
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 
 from undertow.proofs.kernel import compiled as ops
 
-NOWHERE: Mapping[int, int] = {}
-_NONE, _NO_SEEDS = np.empty(0, dtype=np.int64), np.empty((0, 0, 2))
+_NONE, _NO_SEEDS = np.empty(0, dtype=np.int64), np.empty((0, 0), dtype=complex)
 
 FloatArray = NDArray[np.float64]
-Node = tuple[Any, ...]
+Intervals = NDArray[np.complex128]  # as ``compiled`` has them
+Pair = tuple[Intervals, Intervals]
+Array = NDArray[Any]  # of nodes
 
 _OPS = {
     "add": ops.ADD, "sub": ops.SUB, "mul": ops.MUL, "div": ops.DIV, "max": ops.MAX, "min": ops.MIN,
@@ -31,16 +32,18 @@ _OPS = {
     "exp": ops.EXP, "log": ops.LOG, "abs": ops.ABS,
 }  # fmt: skip
 
+_RATIONAL: Mapping[str, Callable[..., Span]] = {
+    "add": operator.add, "sub": operator.sub, "mul": operator.mul, "div": operator.truediv,
+    "neg": operator.neg,
+}  # fmt: skip
+
+_ORDERED: Mapping[str, Callable[..., Fraction]] = {"max": max, "min": min, "abs": abs}
+
 #: Digits from which a rational number is enclosed in doubles instead.
 _MOST_BITS = 40_000
 
 #: Functions with a rational value at a rational number: (where, value).
 _KNOWN = {"sin": (0, 0), "cos": (0, 1), "exp": (0, 1), "log": (1, 0)}
-
-
-def hull(low: Fraction, high: Fraction) -> tuple[float, float]:
-    """Return doubles around [low, high]: the number itself, twice, where it is one."""
-    return ops.enclose(low)[0], ops.enclose(high)[1]
 
 
 class Span:
@@ -89,25 +92,24 @@ class Span:
         return self * Span(1 / other.high, 1 / other.low)
 
 
-def _applied(kind: str, x: Span, y: Span | None = None) -> Span:
+def _applied(kind: str, *of: Span) -> Span:
     """Enclose an operation: exactly where it is rational, else by the compiled arithmetic."""
-    if y is not None:
-        if kind in ("add", "sub"):
-            return x + y if kind == "add" else x - y
-        if kind in ("mul", "div"):
-            return x * y if kind == "mul" else x / y
+    if kind in _RATIONAL:
+        return _RATIONAL[kind](*of)
+    if kind in ("max", "min"):
         raise ArithmeticError(f"{kind}: not smooth")
-    if kind in ("neg", "sqr"):
-        return -x if kind == "neg" else x * x
+    (x,) = of
+    if kind == "sqr":
+        return x * x
     if x.exact and kind in _KNOWN and x.low == _KNOWN[kind][0]:
         return Span(_KNOWN[kind][1])
     if kind == "sqrt" and x.low > 0:
-        low, high = (_root(v) for v in (x.low, x.high))
-        return Span(low[0], high[1])
-    low, high = ops.apply(_OPS[kind], *hull(x.low, x.high), 0.0, 0.0)
-    if not (math.isfinite(low) and math.isfinite(high)):
+        return Span(_root(x.low)[0], _root(x.high)[1])
+    near = ops.hull(x.low, x.high)
+    found = ops.apply(_OPS[kind], near, near)
+    if not np.isfinite(found):
         raise ZeroDivisionError(f"{kind} of a number where it may be undefined")
-    return Span(Fraction(low), Fraction(high))
+    return Span(Fraction(found.real), Fraction(found.imag))
 
 
 def _root(x: Fraction) -> tuple[Fraction, Fraction]:
@@ -126,188 +128,193 @@ class Program:
 
     Parameters
     ----------
-    inputs
-        Number of inputs, which come first.
     code
         (K, 3): operation and two registers.
     constants
-        (C, 2): enclosures of the numbers.
+        (C,): enclosures of the numbers.
     outputs
         Registers of the results, (O,).
     """
 
-    inputs: int
     code: NDArray[np.int64]
-    constants: FloatArray
+    constants: Intervals
     outputs: NDArray[np.int64]
 
-    def __call__(self, low: FloatArray, high: FloatArray, variables: int = 0) -> FloatArray:
-        """Enclose over a box (inputs,): values and derivatives by the first, (O, 1 + V, 2)."""
+    def __call__(self, box: Intervals, variables: int = 0) -> Intervals:
+        """Enclose over a box (inputs,): values and derivatives by the first, (O, 1 + V)."""
         seeds = ops.points(np.eye(variables))
-        jets = ops.jets(self.code, self.constants, low, high, _NONE, 0, seeds)
+        jets = ops.jets(self.code, self.constants, box, _NONE, 0, seeds)
         return np.asarray(jets[self.outputs, 0])
 
-    def series(
-        self, low: FloatArray, high: FloatArray, order: int, seeds: FloatArray = _NO_SEEDS
-    ) -> FloatArray:
+    def expanded(self, box: Intervals, m: FloatArray, fixed: Intervals) -> Pair:
+        """Enclose values and derivatives by the first inputs, (O, 1 + N), and values at m, (O,).
+
+        Over a box of them, (N,), m inside; ``fixed`` are the other inputs.
+        """
+        whole = self(np.concatenate([box, fixed]), len(m))
+        return whole, self(np.concatenate([ops.between(m, m), fixed]))[:, 0]
+
+    def series(self, box: Intervals, order: int, seeds: Intervals = _NO_SEEDS) -> Intervals:
         """Enclose Taylor coefficients of motions ẋ = outputs of the first N inputs.
 
-        Returns (N, order + 1, 1 + V, 2): each with its derivatives by V variables; ``seeds``,
-        (S, V, 2), are those of the first inputs at time 0.
+        Returns (N, order + 1, 1 + V): each with its derivatives by V variables; ``seeds``,
+        (S, V), are those of the first inputs at time 0.
         """
         rates = self.outputs
-        jets = ops.jets(self.code, self.constants, low, high, rates, order, seeds)
+        jets = ops.jets(self.code, self.constants, box, rates, order, seeds)
         return np.asarray(jets[: len(rates)])
+
+
+class Node:
+    """An expression: operation and operands, its number if it is one, whether always defined."""
+
+    __slots__ = ("graph", "index", "kind", "number", "of", "total")
+
+    def __init__(
+        self, graph: Graph, kind: str, of: tuple[Node, ...], number: Fraction | None, total: bool
+    ) -> None:
+        self.graph, self.index, self.kind = graph, graph.size, kind
+        self.of, self.number, self.total = of, number, total
+        graph.size += 1
+
+    def __add__(self, other: Other) -> Node:
+        return self.graph.make("add", self, other)
+
+    def __radd__(self, other: Other) -> Node:
+        return self.graph.make("add", other, self)
+
+    def __sub__(self, other: Other) -> Node:
+        return self.graph.make("sub", self, other)
+
+    def __rsub__(self, other: Other) -> Node:
+        return self.graph.make("sub", other, self)
+
+    def __mul__(self, other: Other) -> Node:
+        return self.graph.make("mul", self, other)
+
+    def __rmul__(self, other: Other) -> Node:
+        return self.graph.make("mul", other, self)
+
+    def __truediv__(self, other: Other) -> Node:
+        return self.graph.make("div", self, other)
+
+    def __rtruediv__(self, other: Other) -> Node:
+        return self.graph.make("div", other, self)
+
+    def __neg__(self) -> Node:
+        return self.graph.make("neg", self)
+
+    def __abs__(self) -> Node:
+        return self.graph.make("abs", self)
+
+
+Other = Node | Fraction | int
+Sides = Mapping[Node, Node]
+NOWHERE: Sides = {}
 
 
 class Graph:
     """Nodes, each made of earlier ones, over a number of inputs."""
 
     def __init__(self, inputs: int) -> None:
-        self.nodes: list[Node] = []
-        self.total: list[bool] = []
-        self._known: dict[Node, int] = {}
-        self.inputs = [self._new(("input", i), True) for i in range(inputs)]
+        self.size = 0
+        self._known: dict[Any, Node] = {}
+        leaves = [Node(self, "input", (), None, True) for _ in range(inputs)]
+        self.inputs: Array = np.array(leaves, dtype=object)
 
-    def _new(self, node: Node, total: bool) -> int:
-        if node not in self._known:
-            self._known[node] = len(self.nodes)
-            self.nodes.append(node)
-            self.total.append(total)
-        return self._known[node]
+    def _new(self, kind: str, of: tuple[Node, ...], number: Fraction | None, total: bool) -> Node:
+        key = kind, number, of
+        if key not in self._known:
+            self._known[key] = Node(self, kind, of, number, total)
+        return self._known[key]
 
-    def number(self, value: Fraction | int) -> int:
+    def number(self, value: Fraction | int) -> Node:
         """Return the node of a rational number."""
-        return self._new(("number", Fraction(value)), True)
+        return self._new("number", (), Fraction(value), True)
 
-    def value(self, k: int) -> Fraction | None:
-        """Return the number that a node is, if it is one."""
-        node = self.nodes[k]
-        return node[1] if node[0] == "number" else None
+    def numbers(self, values: Sequence[Any]) -> Array:
+        """Return an array of rational numbers, or of nodes, as one of nodes."""
+        given = np.array(values, dtype=object)
+        nodes = [v if isinstance(v, Node) else self.number(v) for v in given.flat]
+        return np.array(nodes, dtype=object).reshape(given.shape)
 
-    def make(self, kind: str, a: int = 0, b: int = 0) -> int:
-        """Return the node of an operation, folded where that is exact."""
-        if kind == "pi":
-            return self._new(("pi",), True)
-        if kind == "neg" and self.nodes[a][0] == "neg":
-            return int(self.nodes[a][1])
-        two = _OPS[kind] in ops.BINARY
-        x, y = self.value(a), self.value(b) if two else None
-        known = x is not None and (y is not None or not two) and (kind != "div" or y != 0)
-        if known and x is not None and (folded := _folded(kind, x, y)) is not None:
+    def make(self, kind: str, *operands: Other) -> Node:
+        """Return the node of an operation on nodes or numbers, folded where that is exact."""
+        if any(isinstance(v, np.ndarray) for v in operands):
+            return NotImplemented  # type: ignore[no-any-return]
+        of = tuple(v if isinstance(v, Node) else self.number(v) for v in operands)
+        if kind == "neg" and of[0].kind == "neg":
+            return of[0].of[0]
+        numbers = [k.number for k in of if k.number is not None]
+        if of and len(numbers) == len(of) and (folded := _folded(kind, numbers)) is not None:
             return self.number(folded)
-        if two and (simple := self._simpler(kind, a, b, x, y)) is not None:
+        if len(of) == 2 and (simple := self._simpler(kind, *of)) is not None:
             return simple
-        safe = kind not in ("div", "sqrt", "log") or (kind == "div" and bool(y))
-        total = self.total[a] and (not two or self.total[b]) and safe
-        return self._new((kind, a, b) if two else (kind, a), total)
+        safe = kind not in ("div", "sqrt", "log") or (kind == "div" and bool(of[1].number))
+        return self._new(kind, of, None, safe and all(k.total for k in of))
 
-    def _simpler(
-        self, kind: str, a: int, b: int, x: Fraction | None, y: Fraction | None
-    ) -> int | None:
+    def _simpler(self, kind: str, a: Node, b: Node) -> Node | None:
+        x, y = a.number, b.number
         if kind == "add" and (x == 0 or y == 0):
             return b if x == 0 else a
         if kind == "sub" and y == 0:
             return a
         if kind == "sub" and x == 0:
-            return self.make("neg", b)
+            return -b
         if kind == "mul":
-            if (x == 0 and self.total[b]) or (y == 0 and self.total[a]):
+            if (x == 0 and b.total) or (y == 0 and a.total):
                 return self.number(0)
             if 1 in (x, y):
                 return b if x == 1 else a
             if -1 in (x, y):
-                return self.make("neg", b if x == -1 else a)
-            if a == b:
+                return -b if x == -1 else -a
+            if a is b:
                 return self.make("sqr", a)
         if kind == "div" and y == 1:
             return a
-        if kind == "div" and x == 0 and y:
-            return self.number(0)
         return None
 
     # -- what is written in terms of it --------------------------------------------------------
 
-    def sum(self, terms: Iterable[int]) -> int:
-        """Return the sum of nodes."""
-        return reduce(lambda a, b: self.make("add", a, b), terms, self.number(0))
-
-    def power(self, a: int, k: int) -> int:
+    def power(self, a: Node, k: int) -> Node:
         """Return aᵏ, k ≥ 1, of squares."""
         if k == 1:
             return a
         half = self.make("sqr", self.power(a, k // 2))
-        return self.make("mul", half, a) if k % 2 else half
+        return half * a if k % 2 else half
 
-    def tanh(self, a: int) -> int:
+    def tanh(self, a: Node) -> Node:
         """Return tanh a = 1 − 2/(e^2a + 1); 0 at the number 0."""
-        one, two = self.number(1), self.number(2)
-        e = self.make("exp", self.make("mul", two, a))
-        return self.make("sub", one, self.make("div", two, self.make("add", e, one)))
+        return 1 - 2 / (self.make("exp", 2 * a) + 1)
 
-    def clip(self, a: int, limit: int) -> int:
+    def clip(self, a: Node, limit: Node | Fraction | int) -> Node:
         """Return min(max(a, −limit), limit)."""
-        return self.make("min", self.make("max", a, self.make("neg", limit)), limit)
-
-    def depends(self, roots: Iterable[int], sides: Mapping[int, int] = NOWHERE) -> list[int]:
-        """Return the nodes that some depend on, in order, themselves included."""
-        needed, todo = set[int](), list(roots)
-        while todo:
-            k = todo.pop()
-            if k not in needed:
-                needed.add(k)
-                todo += [sides[k]] if k in sides else self._operands(k)
-        return sorted(needed)
-
-    def _operands(self, k: int) -> list[int]:
-        node = self.nodes[k]
-        return [] if node[0] in ("input", "number", "pi") else [int(v) for v in node[1:]]
+        return self.make("min", self.make("max", a, -limit), limit)
 
     def tangents(
-        self, roots: Sequence[int], seeds: Mapping[int, int], sides: Mapping[int, int] = NOWHERE
-    ) -> list[int]:
+        self, roots: Collection[Node], seeds: Mapping[Node, Node], sides: Sides = NOWHERE
+    ) -> list[Node]:
         """Return derivatives of nodes along seeds (node to its derivative), by the chain rule.
 
         ``sides`` has an operand for a max or min: the one that it is known to be.
         """
-        known = dict(seeds)
-        for k in self.depends(roots, sides):
-            operands = self._operands(k)
+        known: dict[Node, Any] = dict(seeds)
+        for k in depends(roots, sides):
             if k in sides and sides[k] in known:
                 known[k] = known[sides[k]]
-            if k in known or k in sides or not any(j in known for j in operands):
+            if k in known or k in sides or not any(j in known for j in k.of):
                 continue
-            pairs = zip(self._slopes(k), operands, strict=True)
-            known[k] = self.sum(self.make("mul", s, known[j]) for s, j in pairs if j in known)
+            pairs = zip(_slopes(k), k.of, strict=True)
+            known[k] = sum(s * known[j] for s, j in pairs if j in known)
         return [known.get(k, self.number(0)) for k in roots]
 
-    def _slopes(self, k: int) -> list[int]:
-        """Derivatives of a smooth operation by its operands."""
-        make, number, one = self.make, self.number, self.number(1)
-        kind, a, b = self.nodes[k][0], self.nodes[k][1], self.nodes[k][-1]
-        if kind in ("add", "sub"):
-            return [one, one if kind == "add" else number(-1)]
-        if kind == "mul":
-            return [b, a]
-        if kind == "div":
-            return [make("div", one, b), make("neg", make("div", k, b))]
-        if kind == "sqrt":
-            return [make("div", number(Fraction(1, 2)), k)]
-        if kind in ("sin", "cos"):
-            return [make("cos", a) if kind == "sin" else make("neg", make("sin", a))]
-        if kind in ("neg", "exp"):
-            return [k if kind == "exp" else number(-1)]
-        if kind not in ("sqr", "log"):
-            raise ArithmeticError(f"{kind}: not smooth")
-        return [make("mul", number(2), a) if kind == "sqr" else make("div", one, a)]
-
-    def parities(self, roots: Iterable[int], variables: int) -> list[set[int]]:
+    def parities(self, roots: Collection[Node], variables: int) -> list[set[int]]:
         """Which of even (0) and odd (1) in the first inputs nodes are shown to be."""
-        found = dict[int, set[int]]()
-        for k in self.depends(roots):
-            kind, of = self.nodes[k][0], [found[j] for j in self._operands(k)]
+        found = dict[Node, set[int]]()
+        for k in depends(roots):
+            kind, of = k.kind, [found[j] for j in k.of]
             if kind == "input":
-                found[k] = {int(self.nodes[k][1] < variables)}
+                found[k] = {int(k.index < variables)}
             elif kind in ("mul", "div"):
                 found[k] = {(i + j) % 2 for i in of[0] for j in of[1]}
             elif kind in ("sqr", "cos", "abs"):
@@ -315,12 +322,12 @@ class Graph:
             elif kind in ("add", "sub", "neg", "sin"):
                 found[k] = of[0] & of[-1]
             else:
-                found[k] = {0, 1} if self.value(k) == 0 else set.intersection({0}, *of)
+                found[k] = {0, 1} if k.number == 0 else set.intersection({0}, *of)
         return [found[k] for k in roots]
 
     # -- its values ------------------------------------------------------------------------------
 
-    def exact(self, roots: Sequence[int], at: Sequence[Span]) -> list[Span]:
+    def exact(self, roots: Collection[Node], at: Sequence[Span]) -> list[Span]:
         """Evaluate nodes at exact values of inputs.
 
         Raises
@@ -330,74 +337,101 @@ class Graph:
         ArithmeticError
             For numbers with absurdly many digits, or what is not smooth.
         """
-        found = dict[int, Span]()
-        for k in self.depends(roots):
-            kind, *rest = self.nodes[k]
-            if kind == "input":
-                found[k] = at[rest[0]]
-            elif kind == "number":
-                found[k] = Span(rest[0])
-            elif kind == "pi":
-                found[k] = Span(*(Fraction(v) for v in ops.PI))
+        found = dict[Node, Span]()
+        for k in depends(roots):
+            if k.kind == "input":
+                found[k] = at[k.index]
+            elif k.number is not None:
+                found[k] = Span(k.number)
+            elif k.kind == "pi":
+                found[k] = Span(Fraction(ops.PI.real), Fraction(ops.PI.imag))
             else:
-                found[k] = _applied(kind, *(found[j] for j in rest))
+                found[k] = _applied(k.kind, *(found[j] for j in k.of))
             low = found[k].low
             if max(low.numerator.bit_length(), low.denominator.bit_length()) > _MOST_BITS:
                 raise ArithmeticError(f"a number of more than {_MOST_BITS} bits")
         return [found[k] for k in roots]
 
-    def corners(self, roots: Iterable[int]) -> list[int]:
-        """Return the max and min that nodes depend on."""
-        return [k for k in self.depends(roots) if self.nodes[k][0] in ("max", "min")]
+    def not_zero(self, roots: Collection[Node], at: Sequence[Span], what: str) -> str:
+        """Why nodes are not shown to be 0 at exact values of inputs, if they are not."""
+        try:
+            zero = all(v.zero for v in self.exact(roots, at))
+        except ArithmeticError as error:
+            return f"at the target: {error}"
+        return "" if zero else f"{what} is not shown exactly"
 
-    def program(self, roots: Sequence[int], sides: Mapping[int, int] = NOWHERE) -> Program:
+    def program(self, roots: Collection[Node], sides: Sides = NOWHERE) -> Program:
         """Lower what some nodes depend on; every input stays one.
 
         ``sides`` has an operand for a max or min: the one that it is known to be.
         """
-        needed = self.depends(roots, sides)
-        count = len(self.inputs)
-        place = {k: int(self.nodes[k][1]) for k in self.inputs}
-        constants: list[tuple[float, float]] = []
+        needed, place = depends(roots, sides), {k: k.index for k in self.inputs}
+        constants = list[complex]()
         for k in needed:
-            node = self.nodes[k]
-            if node[0] in ("number", "pi"):
-                place[k] = count + len(constants)
-                constants.append(ops.PI if node[0] == "pi" else ops.enclose(node[1]))
-        base, lines = count + len(constants), list[tuple[int, int, int]]()
-        partner = dict[tuple[str, int], int]()  # sin and cos of one operand stand together
+            if k.kind in ("number", "pi"):
+                place[k] = len(self.inputs) + len(constants)
+                constants.append(ops.PI if k.number is None else ops.hull(k.number))
+        base, lines = len(self.inputs) + len(constants), list[tuple[int, int, int]]()
+        sines = dict[int, int]()  # sin and cos of one operand stand together
         for k in needed:
-            node = self.nodes[k]
+            here = base + len(lines)
             if k in place:
                 continue
             if k in sides:
                 place[k] = place[sides[k]]
                 continue
-            kind, operands = str(node[0]), [place[j] for j in self._operands(k)]
-            if kind in ("sin", "cos"):
-                a = operands[0]
-                if (kind, a) not in partner:
-                    here = base + len(lines)
-                    partner["sin", a], partner["cos", a] = here, here + 1
-                    lines += [(ops.SIN, a, here + 1), (ops.COS, a, here)]
-                place[k] = partner[kind, a]
+            of = [place[j] for j in k.of]
+            if k.kind in ("sin", "cos"):
+                if of[0] not in sines:
+                    sines[of[0]] = here
+                    lines += [(ops.SIN, of[0], here + 1), (ops.COS, of[0], here)]
+                place[k] = sines[of[0]] + (k.kind == "cos")
                 continue
-            place[k] = base + len(lines)
-            lines.append((_OPS[kind], operands[0], operands[-1]))
+            place[k] = here
+            lines.append((_OPS[k.kind], of[0], of[-1]))
         return Program(
-            count,
             np.array(lines, dtype=np.int64).reshape(-1, 3),
-            np.array(constants, dtype=float).reshape(-1, 2),
+            np.array(constants, dtype=complex),
             np.array([place[k] for k in roots], dtype=np.int64),
         )
 
 
-def _folded(kind: str, x: Fraction, y: Fraction | None) -> Fraction | None:
+def depends(roots: Iterable[Node], sides: Sides = NOWHERE) -> list[Node]:
+    """Return the nodes that some depend on, in order, themselves included."""
+    needed, todo = set[Node](), list(roots)
+    while todo:
+        k = todo.pop()
+        if k not in needed:
+            needed.add(k)
+            todo += [sides[k]] if k in sides else k.of
+    return sorted(needed, key=operator.attrgetter("index"))
+
+
+def corners(roots: Iterable[Node]) -> list[Node]:
+    """Return the max and min that nodes depend on."""
+    return [k for k in depends(roots) if k.kind in ("max", "min")]
+
+
+def _slopes(k: Node) -> tuple[Other, ...]:
+    """Derivatives of a smooth operation by its operands."""
+    a, b, make = k.of[0], k.of[-1], k.graph.make
+    slopes: Mapping[str, Callable[[], tuple[Other, ...]]] = {
+        "add": lambda: (1, 1), "sub": lambda: (1, -1), "neg": lambda: (-1,),
+        "mul": lambda: (b, a), "div": lambda: (1 / b, -(k / b)), "sqr": lambda: (2 * a,),
+        "sqrt": lambda: (Fraction(1, 2) / k,), "exp": lambda: (k,), "log": lambda: (1 / a,),
+        "sin": lambda: (make("cos", a),), "cos": lambda: (-make("sin", a),),
+    }  # fmt: skip
+    if k.kind not in slopes:
+        raise ArithmeticError(f"{k.kind}: not smooth")
+    return slopes[k.kind]()
+
+
+def _folded(kind: str, numbers: Sequence[Fraction]) -> Fraction | None:
     """The exact value of an operation on numbers, if it has a rational one."""
-    if kind in ("max", "min", "abs"):
-        return abs(x) if y is None else max(x, y) if kind == "max" else min(x, y)
+    if kind in _ORDERED:
+        return _ORDERED[kind](*numbers)
     try:
-        found = _applied(kind, *(Span(v) for v in (x, y) if v is not None))
+        found = _applied(kind, *map(Span, numbers))
     except ArithmeticError:
         return None
     return found.low if found.exact and found.low.denominator.bit_length() < _MOST_BITS else None

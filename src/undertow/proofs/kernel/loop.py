@@ -5,7 +5,7 @@ Coordinates and rates are those of Lemmas 8 and 10 of ``docs/certificate-format.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
@@ -13,9 +13,9 @@ from functools import cached_property
 import numpy as np
 
 from undertow.proofs.kernel import compiled as ops
-from undertow.proofs.kernel.graph import FloatArray, Graph, Program, Span, hull
+from undertow.proofs.kernel.graph import Array, FloatArray, Graph, Intervals, Program, Span
 from undertow.proofs.kernel.model import Law, Matrix, Model, System, input_limits, scale_of, system
-from undertow.proofs.kernel.tube import Field, Held, Sampled, Tube, expanded
+from undertow.proofs.kernel.tube import Field, Held, Sampled, Tube
 
 #: Longest motion, s; steps of one tube, and of all before the checker gives up.
 LONGEST, MOST_OF_ONE, MOST_STEPS = 15.625, 50_000, 500_000
@@ -44,7 +44,7 @@ class Loop:
     Attributes
     ----------
     field, fixed, step
-        How states move, inputs of its graph besides them, (F, 2), and by how much at once, s.
+        How states move, inputs of its graph besides them, (F,), and by how much at once, s.
     coordinates
         States, by a start.
     rows, radius
@@ -54,12 +54,12 @@ class Loop:
     model: Model
     law: Law
     field: Field
-    fixed: FloatArray
-    step: FloatArray
+    fixed: Intervals
+    step: complex
     coordinates: Program
     regular: Program
     rows: Program
-    radius: tuple[float, float]
+    radius: complex
 
     def tube(self, box: FloatArray) -> Tube:
         """Return a box of starts, (N, 2)."""
@@ -70,9 +70,9 @@ class Loop:
 
         Across an edge of the layer s_i moves by parts too (Lemma 13).
         """
-        reach = dict[int, FloatArray]()
+        reach = dict[int, Intervals]()
         for k, layer in enumerate(self.law.layer, 2 * self.model.n - self.model.m):
-            edge, ends = float(layer) * (1 - EDGE), tube.hull[k]
+            edge, ends = float(layer) * (1 - EDGE), (tube.hull[k].real, tube.hull[k].imag)
             cuts = sorted({*ends, *np.clip([-edge, edge], *ends)})
             parts = [replace(tube) for _ in cuts[1:]]
             for part, low, high in zip(parts, cuts, cuts[1:], strict=False):
@@ -81,36 +81,34 @@ class Loop:
                 reach[k] = np.array([part.hull[k] for part in parts])
         if not self._advance(tube):
             return False
-        for k, ends in reach.items():
-            low, high = np.clip([ends.min(), ends.max()], *tube.hull[k])
-            if high - low < np.ptp(tube.hull[k]):
+        for k, after in reach.items():
+            own = tube.hull[k]
+            low, high = np.clip([after.real.min(), after.imag.max()], own.real, own.imag)
+            if high - low < own.imag - own.real:
                 tube.restrict(k, low, high)
         return True
 
     def _advance(self, tube: Tube) -> bool:
-        stay = self.field.advance(tube, float(self.step[1]))
+        stay = self.field.advance(tube, self.step.imag)
         return stay is not None and self.kept(stay, self.fixed)
 
-    def kept(self, stay: FloatArray, fixed: FloatArray) -> bool:
+    def kept(self, stay: Intervals, fixed: Intervals) -> bool:
         """Whether model and law are regular on a box."""
-        low, high = np.vstack([stay, fixed]).T.copy()
-        ends = self.regular(low, high)[:, 0].reshape(-1, self.model.n + 2, 2)
-        kept = (ends[..., 0] > 0.0) | (ends[..., 1] < 0.0)
-        return bool(kept.all() and (ends[:, :-2, 0] > 0.0).all())
+        values = self.regular(np.concatenate([stay, fixed]))[:, 0].reshape(-1, self.model.n + 2)
+        kept = (values.real > 0.0) | (values.imag < 0.0)
+        return bool(kept.all() and (values[:, :-2].real > 0.0).all())
 
-    def aim(self, graph: Graph, x: Sequence[int], W: Matrix, radius: Fraction) -> None:
+    def aim(self, graph: Graph, x: Array, W: Matrix, radius: Fraction) -> None:
         """Take {|W x| ≤ radius} as the set."""
-        self.W, self.radius = np.array([[hull(v, v) for v in r] for r in W]), hull(radius, radius)
-        make, number = graph.make, graph.number
-        parts = [[make("mul", number(w), k) for w, k in zip(row, x, strict=True)] for row in W]
-        self.rows = graph.program([graph.sum(row) for row in parts])
+        self.W, self.radius = ops.hulls(W), ops.hull(radius)
+        self.rows = graph.program(graph.numbers(W) @ x)
 
     def follow(self, box: FloatArray, most: int = MOST_OF_ONE) -> tuple[int, bool]:
         """Return how many steps a tube from a box of starts (N, 2) takes, and whether it ends."""
-        tube, most = self.tube(box), min(int(LONGEST / self.step[1]), most)
+        tube, most = self.tube(box), min(int(LONGEST / self.step.imag), most)
         good, k = tube.map(self.coordinates), 0
         while good and k <= most:
-            if ops.norm(tube.image(self.rows)) <= self.radius[0]:
+            if ops.norm(tube.image(self.rows)) <= self.radius.real:
                 return k, True
             good, k = self.advance(tube), k + 1
         return k, False
@@ -118,7 +116,7 @@ class Loop:
     def arrive(self, boxes: FloatArray) -> Arrival:
         """Follow boxes (K, N, 2), halved across the relatively widest side where they are lost."""
         size = np.maximum(boxes[..., 1].max(axis=0) - boxes[..., 0].min(axis=0), 1e-300)
-        todo, tubes, steps, latest, unit = [*boxes], 0, 0, 0, float(self.step[1])
+        todo, tubes, steps, latest, unit = [*boxes], 0, 0, 0, self.step.imag
         while todo:
             part, tubes = todo.pop(), tubes + 1
             taken, there = self.follow(part)
@@ -141,7 +139,7 @@ class ContinuousLoop(Loop):
         own, plain = System(model, law, momenta=True), system(model, law)
         self.model, self.law = model, law
         self.field, self.fixed = Field(own.graph, own.sliding()), own.fixed()
-        self.step = np.full(2, float(step))
+        self.step = ops.point(float(step))
         self.aim(own.graph, own.x, W, radius)
         self.regular = own.graph.program(own.regular)
         self.coordinates = plain.graph.program(plain.momentum_and_surface())
@@ -177,12 +175,12 @@ class HeldLoop(Loop):
         known.s = at.s  # the coordinate itself
         renewed = known.loop(known.push(layer=False))[1]
         clipped = [
-            d if i.value is None else graph.clip(d, graph.number(i.value))
+            d if i.value is None else graph.clip(d, i.value)
             for d, i in zip(renewed, model.inputs, strict=True)
         ]
         self.rates = [*at.sliding(graph.inputs[-m:]), *([graph.number(0)] * len(varied))]
         self.held = Held(graph, self.rates, clipped)
-        self.fixed, self.step = np.empty((0, 2)), np.array(hull(period, period))
+        self.fixed, self.step = np.empty(0, dtype=complex), ops.hull(period)
         self.demand = known.loop(known.push(layer=True))[1]
         self.inside = self.held.by_states(self.demand)
         self.regular = graph.program([*at.regular, *known.regular])
@@ -204,27 +202,23 @@ class HeldLoop(Loop):
         """Why the target is not shown to be at rest with u = 0 for every plant, if it is not."""
         rest = [Span(0)] * (len(self.graph.inputs) - self.size - len(self.plant))
         at = [*([Span(0)] * self.size), *(Span(*ends) for ends in self.plant), *rest]
-        try:
-            values = self.graph.exact([*self.rates, *self.demand], at)
-        except ArithmeticError as error:
-            return f"at the target: {error}"
-        return "" if all(v.zero for v in values) else "f(0, 0) = 0 is not shown exactly"
+        return self.graph.not_zero([*self.rates, *self.demand], at, "f(0, 0) = 0")
 
     def terminal(self) -> tuple[str, float]:
         """Decide Lemma 11 of the set: what is not shown, or nothing, and a margin."""
         if self.no_equilibrium:
             return self.no_equilibrium, -np.inf
         V, least = ops.inverse(self.W), np.inf
-        half = np.array([ops.up(ops.norm(row) * self.radius[1]) for row in V])
+        half = np.array([ops.up(ops.norm(row) * self.radius.imag) for row in V])
         if not np.isfinite(half).all():
             return "W is not shown to be invertible", -np.inf
-        if not (half[self.size - self.model.m :] <= [hull(v, v)[0] for v in self.law.layer]).all():
+        if not (half[self.size - self.model.m :] <= ops.hulls(self.law.layer).real).all():
             return "the boundary layer is left", -np.inf
-        whole = np.array([hull(*ends) for ends in self.plant]).reshape(-1, 2)
+        whole = ops.ends(self.plant)
         box, todo, tried = np.column_stack([-half, half]), [whole], 0
         while todo:
             part, tried = todo.pop(), tried + 1
-            why, margin = self._contracts(V, np.vstack([box, part]))
+            why, margin = self._contracts(V, ops.between(*np.vstack([box, part]).T))
             if not why:
                 least = min(least, margin)
                 continue
@@ -234,22 +228,22 @@ class HeldLoop(Loop):
             todo += halves(part, int(width.argmax()))
         return "", least
 
-    def slopes(self, X: FloatArray) -> tuple[FloatArray, Sampled]:
+    def slopes(self, X: Intervals) -> tuple[FloatArray, Sampled]:
         """Return z = 0 at the middle of plants, and the demand's derivatives on X."""
-        m, none = self.model.m, np.zeros((self.model.m, 2))
-        middle = np.append(np.zeros(self.size), X[self.size :].mean(axis=1))
-        over, at = expanded(self.inside, X, middle, self.held.fixed())
-        L = ops.mean_values(over, at, *X.T.copy(), middle)[0]
+        m, none, plant = self.model.m, np.zeros(self.model.m, dtype=complex), X[self.size :]
+        middle = np.append(np.zeros(self.size), 0.5 * (plant.real + plant.imag))
+        over, at = self.inside.expanded(X, middle, self.held.fixed())
+        L = ops.mean_values(over, at, X, middle)[0]
         return middle, Sampled(none, none, L[m:], at[m:], over[m:, 1:])
 
-    def _contracts(self, V: FloatArray, X: FloatArray) -> tuple[str, float]:
-        """Decide Lemma 11 for a part of the plants: X (N, 2) is a box around the set, and it."""
+    def _contracts(self, V: Intervals, X: Intervals) -> tuple[str, float]:
+        """Decide Lemma 11 for a part of the plants: X (N,) is a box around the set, and it."""
         size, (middle, law) = self.size, self.slopes(X)
-        rows = ops.product(law.L.reshape(-1, len(X), 2)[:, :size].copy(), V)
-        most = np.array([ops.up(ops.norm(row) * self.radius[1]) for row in rows])
+        rows = ops.product(law.L.reshape(-1, len(X))[:, :size].copy(), V)
+        most = np.array([ops.up(ops.norm(row) * self.radius.imag) for row in rows])
         if not (most <= input_limits(self.model)).all():
             return "an input limit is met", -np.inf
-        law = law._replace(u=np.column_stack([-most, most]))
+        law = law._replace(u=ops.between(-most, most))
         found = self.held.derivative(X, middle, law, self.step)
         if found is None:
             return "motions over a period have no bounds", -np.inf
@@ -257,7 +251,7 @@ class HeldLoop(Loop):
             return "model and law are not shown to be regular", -np.inf
         E = found[0][:size, :size].copy()
         for i in range(size):
-            E[i, i] = ops.add(*E[i, i], -1.0, -1.0)
+            E[i, i] = ops.add(E[i, i], ops.point(-1.0))
         margin = ops.decrease(ops.product(ops.product(self.W, E), V), True)
         return ("" if margin > 0.0 else "|W z| is not shown to fall"), margin
 

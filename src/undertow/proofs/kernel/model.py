@@ -6,18 +6,18 @@ Formulas and Lemmas 1 and 2 of ``docs/certificate-format.md``, section 4.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial, reduce
 from typing import Any
 
 import numpy as np
 
-from undertow.proofs.kernel.graph import FloatArray, Graph, Span, hull
+from undertow.proofs.kernel.compiled import hull, hulls
+from undertow.proofs.kernel.graph import Array, FloatArray, Graph, Intervals, Node, Span
 
 Matrix = tuple[tuple[Fraction, ...], ...]
-Nodes = list[list[int]]
 
 
 @dataclass(frozen=True)
@@ -68,12 +68,9 @@ class Model:
         names = [p.name for p in self.positions]
         return (*names, *(f"{name}_dot" for name in names))
 
-    def lay(
-        self, graph: Graph, leaves: Sequence[int] | None = None
-    ) -> tuple[Nodes, list[int], Nodes]:
-        """Lay M, f and B on a graph; x and then p are its first inputs, or other nodes."""
-        n, at = self.n, list[int]()
-        leaves = graph.inputs if leaves is None else leaves
+    def lay(self, graph: Graph, leaves: Sequence[Node] | Array) -> tuple[Array, Array, Array]:
+        """Lay M (n, n), f (n,) and B (m, m) on a graph: x and then p are these nodes."""
+        n, at = self.n, list[Node]()
         first = {"position": 0, "velocity": n, "parameter": 2 * n}
         for kind, *rest in self.nodes:
             if kind == "number":
@@ -86,8 +83,9 @@ class Model:
                 at.append(graph.tanh(at[rest[0]]))
             else:
                 at.append(graph.make(kind, *(at[k] for k in rest)))
-        mass = [[at[self.M[max(i, j)][min(i, j)]] for j in range(n)] for i in range(n)]
-        return mass, [at[k] for k in self.f], [[at[k] for k in row] for row in self.B]
+        nodes = np.array(at, dtype=object)
+        mass = [[self.M[max(i, j)][min(i, j)] for j in range(n)] for i in range(n)]
+        return nodes[mass], nodes[list(self.f)], nodes[list(map(list, self.B))]
 
 
 @dataclass(frozen=True)
@@ -103,337 +101,242 @@ class Law:
     switching: str
     disturbance: tuple[Fraction, ...]
 
-    @property
-    def numbers(self) -> tuple[Fraction, ...]:
-        """α_a, λ_a, α_u, λ_u row by row, η, ε."""
-        blocks = (self.alpha_a, self.lambda_a, self.alpha_u, self.lambda_u)
-        return (*(v for b in blocks for row in b for v in row), *self.eta, *self.layer)
+
+# -- matrices of nodes, (…,) ----------------------------------------------------------------------
 
 
-class Algebra:
-    """Matrices of nodes."""
+def identity(size: int, number: Callable[[int], Any]) -> Array:
+    """Return I, of nodes or of other numbers."""
+    return np.array([[number(int(i == j)) for j in range(size)] for i in range(size)], dtype=object)
 
-    def __init__(self, graph: Graph) -> None:
-        self.graph = graph
 
-    def times(self, A: Nodes, B: Nodes) -> Nodes:
-        """A B."""
-        make = self.graph.make
-        return [
-            [self.graph.sum(make("mul", a, row[j]) for a, row in zip(r, B, strict=True))
-             for j in range(len(B[0]))]
-            for r in A
-        ]  # fmt: skip
+def factor(A: Array) -> tuple[Array, list[Node]]:
+    """L and D of A = L D Lᵀ, symmetric."""
+    n, D = len(A), list[Node]()
+    L = identity(n, A[0, 0].graph.number)
+    for j in range(n):
+        D.append(A[j, j] - sum(L[j, k] * L[j, k] * D[k] for k in range(j)))
+        for i in range(j + 1, n):
+            L[i, j] = (A[i, j] - sum(L[i, k] * L[j, k] * D[k] for k in range(j))) / D[j]
+    return L, D
 
-    def each(self, kind: str, A: Nodes, B: Nodes | None = None) -> Nodes:
-        """Apply an operation entry by entry."""
-        if B is None:
-            return [[self.graph.make(kind, a) for a in row] for row in A]
-        return [
-            [self.graph.make(kind, a, b) for a, b in zip(r, s, strict=True)]
-            for r, s in zip(A, B, strict=True)
-        ]
 
-    def factor(self, A: Nodes) -> tuple[Nodes, list[int]]:
-        """L and D of A = L D Lᵀ, symmetric."""
-        make, n = self.graph.make, len(A)
-        L = [[self.graph.number(int(i == j)) for j in range(n)] for i in range(n)]
-        D: list[int] = []
-        for j in range(n):
-            part = self.graph.sum(make("mul", make("sqr", L[j][k]), D[k]) for k in range(j))
-            D.append(make("sub", A[j][j], part))
-            for i in range(j + 1, n):
-                part = self.graph.sum(
-                    make("mul", make("mul", L[i][k], L[j][k]), D[k]) for k in range(j)
-                )
-                L[i][j] = make("div", make("sub", A[i][j], part), D[j])
-        return L, D
+def solve(factors: tuple[Array, list[Node]], B: Array) -> Array:
+    """A⁻¹ B from the factors of A, for a matrix or a vector."""
+    (L, D), z, n = factors, list[Any](), len(B)
+    for i in range(n):
+        z.append(B[i] - sum(L[i, k] * z[k] for k in range(i)))
+    z = [v / d for v, d in zip(z, D, strict=True)]
+    for i in reversed(range(n)):
+        z[i] = z[i] - sum(L[k, i] * z[k] for k in range(i + 1, n))
+    return np.array(z, dtype=object)
 
-    def solve(self, factor: tuple[Nodes, list[int]], B: Nodes) -> Nodes:
-        """A⁻¹ B from the factors of A."""
-        (L, D), make, n = factor, self.graph.make, len(B)
-        out: Nodes = [[0] * len(B[0]) for _ in range(n)]
-        for c in range(len(B[0])):
-            z: list[int] = []
-            for i in range(n):
-                part = self.graph.sum(make("mul", L[i][k], z[k]) for k in range(i))
-                z.append(make("sub", B[i][c], part))
-            z = [make("div", v, d) for v, d in zip(z, D, strict=True)]
-            for i in reversed(range(n)):
-                part = self.graph.sum(make("mul", L[k][i], z[k]) for k in range(i + 1, n))
-                z[i] = make("sub", z[i], part)
-            for i in range(n):
-                out[i][c] = z[i]
-        return out
 
-    def adjugate(self, A: Nodes) -> tuple[Nodes, int]:
-        """Adj A and det A, without a division by entries (Faddeev and LeVerrier)."""
-        make, number, m = self.graph.make, self.graph.number, len(A)
-        N: Nodes = [[number(int(i == j)) for j in range(m)] for i in range(m)]
-        for k in range(1, m + 1):
-            step = self.times(A, N)
-            trace = self.graph.sum(step[i][i] for i in range(m))
-            c = make("mul", number(Fraction(-1, k)), trace)
-            if k == m:
-                break
-            N = [[make("add", v, c) if i == j else v for j, v in enumerate(row)]
-                 for i, row in enumerate(step)]  # fmt: skip
-        sign = number((-1) ** (m - 1))
-        return [[make("mul", sign, v) for v in row] for row in N], make("mul", number((-1) ** m), c)
+def characteristic(A: Array, number: Callable[[Any], Any]) -> tuple[list[Any], Array]:
+    """Coefficients of det(x − A), highest power first, and adj A (Faddeev and LeVerrier).
 
-    def inverse(self, A: Nodes) -> tuple[Nodes, int]:
-        """A⁻¹, undefined where det A = 0, and det A."""
-        adjugate, determinant = self.adjugate(A)
-        once = self.graph.make("div", self.graph.number(1), determinant)
-        return [[self.graph.make("mul", v, once) for v in row] for row in adjugate], determinant
+    A is of nodes or of other numbers, and ``number`` makes one.
+    """
+    size, out = len(A), [number(1)]
+    N, diagonal = identity(size, number), np.diag_indices(size)
+    for k in range(1, size + 1):
+        step = A @ N
+        out.append(number(Fraction(-1, k)) * step.trace())
+        if k < size:
+            N = step
+            N[diagonal] = N[diagonal] + out[-1]
+    return out, N * number((-1) ** (size - 1))
+
+
+def adjugate(A: Array) -> tuple[Array, Node]:
+    """Adj A and det A, without a division by entries."""
+    number = A[0, 0].graph.number
+    coefficients, out = characteristic(A, number)
+    return out, number((-1) ** len(A)) * coefficients[-1]
+
+
+def inverse(A: Array) -> tuple[Array, Node]:
+    """A⁻¹, undefined where det A = 0, and det A."""
+    out, determinant = adjugate(A)
+    return out * (1 / determinant), determinant
 
 
 @dataclass(frozen=True)
 class Sliding:
     """The motion on the surface (5.1): v_a, v̇_u, pivots of M ≻ 0, and det α_a and det E."""
 
-    v_a: Nodes
-    v_u_dot: Nodes
-    pivots: list[int]
-    determinants: list[int]
+    v_a: Array
+    v_u_dot: Array
+    pivots: list[Node]
+    determinants: list[Node]
 
     @classmethod
     def of(
-        cls, algebra: Algebra, model: Model, law: Law, q: Nodes, pull: Nodes, v_u: Nodes,
-        p: Sequence[int],
+        cls, graph: Graph, model: Model, law: Law, q: Array, pull: Array, v_u: Array,
+        p: Sequence[Node],
     ) -> Sliding:  # fmt: skip
         """Lay it on a graph, of nodes q, pull = λ_a q_a + λ_u q_u, v_u and parameters."""
-        graph, m = algebra.graph, model.m
-        lambda_a, lambda_u, alpha_a, alpha_u = (
-            [[graph.number(v) for v in row] for row in block]
-            for block in (law.lambda_a, law.lambda_u, law.alpha_a, law.alpha_u)
-        )
-        alpha, first = algebra.inverse(alpha_a)
-        pull = algebra.each("add", pull, algebra.times(alpha_u, v_u))
-        v_a = algebra.each("neg", algebra.times(alpha, pull))
-        M, f, _ = model.lay(graph, [*(r[0] for r in (*q, *v_a, *v_u)), *p])
-        order = [*range(m, model.n), *range(m)]
-        _, pivots = algebra.factor([[M[i][j] for j in order] for i in order])
-        thrown = algebra.times([row[:m] for row in M[m:]], alpha)
-        E = algebra.each("sub", [row[m:] for row in M[m:]], algebra.times(thrown, alpha_u))
-        drift = algebra.each("add", algebra.times(lambda_a, v_a), algebra.times(lambda_u, v_u))
-        right = algebra.each("add", [[v] for v in f[m:]], algebra.times(thrown, drift))
-        back, second = algebra.inverse(E)
-        return cls(v_a, algebra.times(back, right), pivots, [first, second])
+        n, m = model.n, model.m
+        lambda_a, lambda_u = graph.numbers(law.lambda_a), graph.numbers(law.lambda_u)
+        alpha_u = graph.numbers(law.alpha_u)
+        alpha, first = inverse(graph.numbers(law.alpha_a))
+        v_a = -(alpha @ (pull + alpha_u @ v_u))
+        M, f, _ = model.lay(graph, [*q, *v_a, *v_u, *p])
+        order = [*range(m, n), *range(m)]
+        _, pivots = factor(M[np.ix_(order, order)])
+        thrown = M[m:, :m] @ alpha
+        back, second = inverse(M[m:, m:] - thrown @ alpha_u)
+        right = f[m:] + thrown @ (lambda_a @ v_a + lambda_u @ v_u)
+        return cls(v_a, back @ right, pivots, [first, second])
 
 
 class System:
     """The plant and the law on one graph: everything that claims are about.
 
-    The inputs are x = (q, q̇), then the parameters, then, where ``law`` is None, the numbers of
-    a law as :attr:`Law.numbers` gives them; else they are exact in the graph.  ``leaves`` are other
-    nodes for x and the parameters, of their own ``graph``.  With ``momenta`` the first of them are
-    (q, p, s) instead, and ``x`` are nodes of them.
+    The inputs are x = (q, q̇) and then the parameters; ``leaves`` are other nodes for them, of their
+    own ``graph``, of which the law's numbers may be nodes too.  With ``momenta`` the first of them
+    are (q, p, s) instead, and ``x`` are nodes of them.
     """
 
     def __init__(
         self,
         model: Model,
-        law: Law | None,
-        switching: str = "saturation",
-        disturbance: Sequence[Fraction] = (),
+        law: Law,
         momenta: bool = False,
         graph: Graph | None = None,
-        leaves: Sequence[int] = (),
+        leaves: Sequence[Node] | Array = (),
     ) -> None:
         n, m = model.n, model.m
-        self.model, self.law = model, law
-        self.switching = law.switching if law is not None else switching
-        bounds = law.disturbance if law is not None else disturbance
-        fixed = 2 * n + len(model.parameters)
         if graph is None:
-            graph = Graph(fixed + (2 * m * n + 2 * m if law is None else 0))
-            leaves = graph.inputs[:fixed]
-        self.graph = graph
-        nodes = graph.inputs[fixed:] if law is None else [graph.number(v) for v in law.numbers]
-        given = iter(nodes)
-
-        def block(rows: int, columns: int) -> Nodes:
-            return [[next(given) for _ in range(columns)] for _ in range(rows)]
-
-        self.alpha_a, self.lambda_a = block(m, m), block(m, m)
-        self.alpha_u, self.lambda_u = block(m, n - m), block(m, n - m)
-        self.eta, self.layer = block(1, m)[0], block(1, m)[0]
-        self.x = list(leaves[: 2 * n])
+            graph = Graph(2 * n + len(model.parameters))
+            leaves = graph.inputs
+        self.model, self.law, self.graph = model, law, graph
+        self.alpha_a, self.lambda_a = graph.numbers(law.alpha_a), graph.numbers(law.lambda_a)
+        self.alpha_u, self.lambda_u = graph.numbers(law.alpha_u), graph.numbers(law.lambda_u)
+        self.eta, self.layer = graph.numbers(law.eta), graph.numbers(law.layer)
+        self.x = np.array(leaves[: 2 * n], dtype=object)
         self.M, self.f, self.B = model.lay(graph, leaves)
-        self.algebra = algebra = Algebra(graph)
-        M_aa, self.M_au = [r[:m] for r in self.M[:m]], [r[m:] for r in self.M[:m]]
-        self.M_ua, M_uu = [r[:m] for r in self.M[m:]], [r[m:] for r in self.M[m:]]
-        self.uu = algebra.factor(M_uu)
-        self.X = algebra.solve(self.uu, self.M_ua)
-        self.S = algebra.each("sub", M_aa, algebra.times(self.M_au, self.X))
-        self.S = [[self.S[max(i, j)][min(i, j)] for j in range(m)] for i in range(m)]
-        self.ss = algebra.factor(self.S)
-        self.gamma = algebra.each("sub", self.alpha_a, algebra.times(self.alpha_u, self.X))
-        self.gamma_adjugate, self.gamma_determinant = algebra.adjugate(self.gamma)
-        self.B_adjugate, self.B_determinant = algebra.adjugate(self.B)
-        self.bounds = [graph.number(v) for v in bounds]
+        self.M_au, M_uu = self.M[:m, m:], self.M[m:, m:]
+        self.uu = factor(M_uu)
+        self.X = solve(self.uu, self.M[m:, :m])
+        S = self.M[:m, :m] - self.M_au @ self.X
+        self.S = np.where(np.tri(m, dtype=bool), S, S.T)
+        self.ss = factor(self.S)
+        self.gamma = self.alpha_a - self.alpha_u @ self.X
+        self.gamma_adjugate, self.gamma_determinant = adjugate(self.gamma)
+        self.B_adjugate, self.B_determinant = adjugate(self.B)
         if momenta:
             self._slide(leaves)
 
-    def _slide(self, z: Sequence[int]) -> None:
+    def _slide(self, leaves: Sequence[Node] | Array) -> None:
         """Take the inputs for (q, p, s): q̇ from M_ua v_a + M_uu v_u = D p, and s."""
-        graph, algebra, n, m = self.graph, self.algebra, self.model.n, self.model.m
-        p = [graph.make("mul", d, v) for d, v in zip(self.scale, z[n : 2 * n - m], strict=True)]
-        y = algebra.solve(self.uu, self._column(p))
-        self.s = list(z[2 * n - m : 2 * n])
-        right = algebra.each("sub", self._column(self.s), algebra.times(self.alpha_u, y))
-        for A, q in ((self.lambda_a, z[:m]), (self.lambda_u, z[m:n])):
-            right = algebra.each("sub", right, algebra.times(A, self._column(q)))
-        v_a = algebra.times(self.gamma_adjugate, right)
-        v_a = [[graph.make("div", row[0], self.gamma_determinant)] for row in v_a]
-        v_u = algebra.each("sub", y, algebra.times(self.X, v_a))
-        self.x = [*z[:n], *(row[0] for row in (*v_a, *v_u))]
-        _, self.f, _ = self.model.lay(graph, [*self.x, *z[2 * n :]])
+        n, m = self.model.n, self.model.m
+        q_a, q_u, p, self.s = np.split(self.x, [m, n, 2 * n - m])
+        y = solve(self.uu, self.scale * p)
+        right = self.s - self.alpha_u @ y - self.lambda_a @ q_a - self.lambda_u @ q_u
+        v_a = self.gamma_adjugate @ right / self.gamma_determinant
+        self.x = np.concatenate([q_a, q_u, v_a, y - self.X @ v_a])
+        _, self.f, _ = self.model.lay(self.graph, [*self.x, *leaves[2 * n :]])
 
     @cached_property
-    def scale(self) -> list[int]:
+    def scale(self) -> Array:
         """D, (n − m,), near the diagonal of M_uu at the target: p is of the size of a rate."""
-        return [self.graph.number(v) for v in scale_of(self.model)]
+        return self.graph.numbers(scale_of(self.model))
 
-    def momentum_and_surface(self) -> list[int]:
+    def momentum_and_surface(self) -> list[Node]:
         """Return (q, p, s) by x."""
-        n, m = self.model.n, self.model.m
-        p = [row[0] for row in self.algebra.times(self.M[m:], self._column(self.x[n:]))]
-        p = [self.graph.make("div", a, d) for a, d in zip(p, self.scale, strict=True)]
-        return [*self.x[:n], *p, *self.s]
+        q, v = np.split(self.x, 2)
+        return [*q, *(self.M[self.model.m :] @ v / self.scale), *self.s]
 
-    def sliding(self, u: Sequence[int] | None = None) -> list[int]:
+    def sliding(self, u: Array | None = None) -> list[Node]:
         """Return the rates of (q, p, s), of the loop with its layer and its clip (Lemma 8).
 
         With other inputs u, nodes, those of the plant with them (Lemma 10).
         """
-        graph, algebra, n, m = self.graph, self.algebra, self.model.n, self.model.m
-        make, zero, v = graph.make, graph.number(0), self.x[n:]
-        speeds = dict(zip(self.x[:n], v, strict=True))
-        turned = [graph.tangents(row, speeds) for row in self.M[m:]]
-        force = algebra.each(
-            "add", self._column(self.f[m:]), algebra.times(turned, self._column(v))
-        )
-        p_dot = [make("div", row[0], d) for row, d in zip(force, self.scale, strict=True)]
-        push = [zero] * m if u is not None else self.push(layer=False)
-        over: Nodes = []  # d − u
-        for i, (d, limit) in enumerate(zip(self.loop(push)[1], self.model.inputs, strict=True)):
-            if u is not None:
-                over.append([make("sub", d, u[i])])
-                continue
-            end = graph.number(limit.value or 0)
-            above = make("max", make("sub", d, end), zero)
-            below = make("min", make("add", d, end), zero)
-            over.append([zero if limit.value is None else make("add", above, below)])
-        lost = algebra.times(self.gamma, algebra.solve(self.ss, algebra.times(self.B, over)))
-        pairs = zip(push, lost, strict=True)
-        return [*v, *p_dot, *(make("neg", make("add", a, row[0])) for a, row in pairs)]
+        graph, m = self.graph, self.model.m
+        q, v = np.split(self.x, 2)
+        speeds = dict(zip(q, v, strict=True))
+        turned = np.array([graph.tangents(row, speeds) for row in self.M[m:]], dtype=object)
+        p_dot = (self.f[m:] + turned @ v) / self.scale
+        push = graph.numbers([0] * m) if u is not None else self.push(layer=False)
+        demand = self.loop(push)[1]
+        clip = [self._beyond(*pair) for pair in zip(demand, self.model.inputs, strict=True)]
+        over = np.array(clip, dtype=object) if u is None else demand - u  # d − u
+        lost = self.gamma @ solve(self.ss, self.B @ over)
+        return [*v, *p_dot, *(-(push + lost))]
+
+    def _beyond(self, demand: Node, own: Quantity) -> Node:
+        """What the clip takes off a demand."""
+        if own.value is None:
+            return self.graph.number(0)
+        make = self.graph.make
+        return make("max", demand - own.value, 0) + make("min", demand + own.value, 0)
 
     @property
-    def regular(self) -> list[int]:
+    def regular(self) -> list[Node]:
         """Pivots of M, which are to be > 0, then det B and det Γ, which are not to be 0."""
         return [*self.pivots, self.B_determinant, self.gamma_determinant]
 
     @property
     def odd(self) -> bool:
         """Whether M and B are shown to be even in x, and f odd: motions come in pairs (Lemma 9)."""
-        even = [v for row in (*self.M, *self.B) for v in row]
+        even = [*self.M.flat, *self.B.flat]
         shown = self.graph.parities([*even, *self.f], 2 * self.model.n)
         return all((k >= len(even)) in parity for k, parity in enumerate(shown))
 
     @property
-    def pivots(self) -> list[int]:
+    def pivots(self) -> list[Node]:
         """Those of M with the unactuated block first: all > 0 iff M is positive definite."""
         return [*self.uu[1], *self.ss[1]]
 
-    def _absolute(self, A: Nodes) -> Nodes:
-        return self.algebra.each("abs", A)
-
-    def _one(self, k: int) -> Nodes:
-        return [[self.graph.number(int(i == j)) for j in range(k)] for i in range(k)]
-
-    def _column(self, nodes: Sequence[int]) -> Nodes:
-        return [[v] for v in nodes]
-
     @cached_property
-    def s(self) -> list[int]:
+    def s(self) -> Array:
         """s, (m,)."""
-        graph, n, m = self.graph, self.model.n, self.model.m
-        x = self.x
-        parts = (
-            (self.alpha_a, x[n : n + m]), (self.lambda_a, x[:m]),
-            (self.alpha_u, x[n + m : 2 * n]), (self.lambda_u, x[m:n]),
-        )  # fmt: skip
-        products = [self.algebra.times(A, self._column(v)) for A, v in parts]
-        return [graph.sum(p[i][0] for p in products) for i in range(m)]
+        n, m = self.model.n, self.model.m
+        q_a, q_u, v_a, v_u = np.split(self.x, [m, n, n + m])
+        on = self.alpha_a @ v_a + self.lambda_a @ q_a + self.alpha_u @ v_u + self.lambda_u @ q_u
+        return np.asarray(on)
 
     @cached_property
-    def gains(self) -> list[int]:
+    def gains(self) -> Array:
         """k, (m,)."""
-        graph, algebra, m, n = self.graph, self.algebra, self.model.m, self.model.n
-        if not any(graph.value(b) != 0 for b in self.bounds):
+        graph, m, n = self.graph, self.model.m, self.model.n
+        if not any(self.law.disturbance):
             return self.eta
-        g_a, g_u = self._column(self.bounds[:m]), self._column(self.bounds[m:])
-        X = self._absolute(self.X)
-        transposed = [list(r) for r in zip(*X, strict=True)]
-        S_inverse = self._absolute(algebra.solve(self.ss, self._one(m)))
-        uu_inverse = self._absolute(algebra.solve(self.uu, self._one(n - m)))
-        a = algebra.times(S_inverse, algebra.each("add", g_a, algebra.times(transposed, g_u)))
-        b = algebra.each("add", algebra.times(uu_inverse, g_u), algebra.times(X, a))
-        largest = []
-        for column in (a, b):
-            top = column[0][0]
-            for row in column[1:]:
-                top = graph.make("max", top, row[0])
-            largest.append(top)
-        k = []
-        for i in range(m):
-            total = self.eta[i]
-            for rows, top in ((self.alpha_a, largest[0]), (self.alpha_u, largest[1])):
-                weight = graph.sum(graph.make("abs", v) for v in rows[i])
-                total = graph.make("add", total, graph.make("mul", weight, top))
-            k.append(total)
+        g_a, g_u = np.split(graph.numbers(self.law.disturbance), [m])
+        X = abs(self.X)
+        S_inverse = abs(solve(self.ss, identity(m, graph.number)))
+        uu_inverse = abs(solve(self.uu, identity(n - m, graph.number)))
+        a = S_inverse @ (g_a + X.T @ g_u)
+        b = uu_inverse @ g_u + X @ a
+        k = self.eta
+        for rows, column in ((self.alpha_a, a), (self.alpha_u, b)):
+            k = k + abs(rows).sum(axis=1) * reduce(partial(graph.make, "max"), column)
         return k
 
-    def push(self, *, layer: bool) -> list[int]:
+    def push(self, *, layer: bool) -> Array:
         """K σ, (m,), with s_i/ε_i in place of its saturation if ``layer``, as inside of it."""
-        graph, push = self.graph, []
-        for s, e, k in zip(self.s, self.layer, self.gains, strict=True):
-            ratio = graph.make("div", s, e)
-            if self.switching == "tanh":
-                ratio = graph.tanh(ratio)
-            elif not layer:
-                ratio = graph.clip(ratio, graph.number(1))
-            push.append(graph.make("mul", k, ratio))
-        return push
+        graph, ratio = self.graph, self.s / self.layer
+        if self.law.switching == "tanh":
+            ratio = np.array([graph.tanh(r) for r in ratio], dtype=object)
+        elif not layer:
+            ratio = np.array([graph.clip(r, 1) for r in ratio], dtype=object)
+        return np.asarray(self.gains * ratio)
 
-    def loop(self, push: Sequence[int]) -> tuple[list[int], list[int]]:
+    def loop(self, push: Array) -> tuple[list[Node], Array]:
         """Return q̈ (n,) and the demand d (m,) of the loop whose input is it, with K σ = push."""
-        graph, algebra, n, m = self.graph, self.algebra, self.model.n, self.model.m
-        make = graph.make
-        y = algebra.solve(self.uu, self._column(self.f[m:]))
-        h = algebra.each("sub", self._column(self.f[:m]), algebra.times(self.M_au, y))
-        x = self.x
-        drive = algebra.times(self.alpha_u, y)
-        for A, v in ((self.lambda_a, x[n : n + m]), (self.lambda_u, x[n + m : 2 * n])):
-            drive = algebra.each("add", drive, algebra.times(A, self._column(v)))
-        drive = algebra.each("add", drive, self._column(push))
-        w = [
-            [make("neg", make("div", row[0], self.gamma_determinant))]
-            for row in algebra.times(self.gamma_adjugate, drive)
-        ]
-        force = algebra.each("sub", algebra.times(self.S, w), h)
-        demand = [
-            make("div", row[0], self.B_determinant) for row in algebra.times(self.B_adjugate, force)
-        ]
-        free = algebra.each("sub", y, algebra.times(self.X, w))
-        return [row[0] for row in (*w, *free)], demand
+        n, m = self.model.n, self.model.m
+        v_a, v_u = np.split(self.x[n:], [m])
+        y = solve(self.uu, self.f[m:])
+        h = self.f[:m] - self.M_au @ y
+        drive = self.alpha_u @ y + self.lambda_a @ v_a + self.lambda_u @ v_u + push
+        w = -(self.gamma_adjugate @ drive / self.gamma_determinant)
+        demand = self.B_adjugate @ (self.S @ w - h) / self.B_determinant
+        return [*w, *(y - self.X @ w)], demand
 
-    def fixed(self) -> FloatArray:
+    def fixed(self) -> Intervals:
         """Enclosures of the parameters."""
-        values = [p.value for p in self.model.parameters]
-        return np.array([hull(v, v) for v in values if v is not None]).reshape(-1, 2)
+        return np.asarray(hulls([p.value for p in self.model.parameters]))
 
     def origin(self) -> list[Span]:
         """Exact inputs at x = 0."""
@@ -443,7 +346,7 @@ class System:
 
 def input_limits(model: Model) -> FloatArray:
     """Lower bounds of the input limits, (m,), ∞ for none."""
-    ends = [math.inf if i.value is None else hull(i.value, i.value)[0] for i in model.inputs]
+    ends = [math.inf if i.value is None else hull(i.value).real for i in model.inputs]
     return np.array(ends)
 
 
@@ -459,7 +362,7 @@ def scale_of(model: Model) -> tuple[Fraction, ...]:
     graph = Graph(2 * model.n)
     leaves = [*graph.inputs, *(graph.number(p.value or 0) for p in model.parameters)]
     mass, _, _ = model.lay(graph, leaves)
-    at = graph.exact([mass[i][i] for i in range(model.m, model.n)], [Span(0)] * (2 * model.n))
+    at = graph.exact(mass.diagonal()[model.m :], [Span(0)] * (2 * model.n))
     return tuple(Fraction(float(v.low)) for v in at)
 
 

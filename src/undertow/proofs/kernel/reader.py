@@ -5,15 +5,12 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
 from undertow.proofs.kernel.model import Law, Matrix, Model, Quantity
-
-__all__ = ["Document", "Refused", "Subject", "canonical", "digest", "interval", "matrix", "number",
-           "number_text", "numbers", "read", "read_law", "read_model"]  # fmt: skip
 
 FORMAT, VERSION = "undertow-certificate", 2
 
@@ -64,16 +61,6 @@ def number(text: Any) -> Fraction:
     above, _, below = text.partition("/")
     require(not below or int(below) > 0, f"number {text[:40]!r}: a divisor of 0")
     return Fraction(int(above), int(below or 1))
-
-
-def number_text(value: Fraction | float) -> str:
-    """Return the number text of a double, or of a rational number: what :func:`number` reads."""
-    exact = Fraction(value)
-    try:
-        near = exact.numerator / exact.denominator
-    except OverflowError:
-        return str(exact)
-    return near.hex() if exact.denominator > 1 and Fraction(near) == exact else str(exact)
 
 
 def numbers(data: Any, count: int) -> tuple[Fraction, ...]:
@@ -231,11 +218,8 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return dict(pairs)
 
 
-def _refuse(what: str) -> Callable[[str], Any]:
-    def refuse(text: str) -> Any:
-        raise Refused(f"{what}, {text[:40]}")
-
-    return refuse
+def _refuse(text: str) -> Any:
+    raise Refused(f"a JSON number that is not whole: {text[:40]}")
 
 
 def _whole(text: str) -> int:
@@ -258,8 +242,7 @@ def parse(content: bytes) -> dict[str, Any]:
     try:
         data = json.loads(
             text, object_pairs_hook=_object, parse_int=_whole,
-            parse_float=_refuse("a JSON number that is not whole"),
-            parse_constant=_refuse("no number"),
+            parse_float=_refuse, parse_constant=_refuse,
         )  # fmt: skip
     except (json.JSONDecodeError, RecursionError) as error:
         raise Refused(f"no JSON: {error}") from error

@@ -11,14 +11,15 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.bound import Goal, Settled, halved, settle
-from undertow.proofs.kernel.graph import FloatArray, Graph, Program, Span, hull
-from undertow.proofs.kernel.model import Algebra, Law, Matrix, Model, Nodes, Sliding
+from undertow.proofs.kernel.graph import Array, FloatArray, Graph, Intervals, Node, Program, Span
+from undertow.proofs.kernel.model import Law, Matrix, Model, Sliding, identity, inverse
 
 #: Boxes that are looked at together, and points of them that are tried for a counterexample.
 CHUNK, TRIED = 4096, 16
@@ -58,74 +59,61 @@ class Stretch:
 class _Chart:
     """The stretch on a graph at y_0 = q, a node: (I + Σ τ^j S_j) and its derivative by y_0."""
 
-    def __init__(self, algebra: Algebra, stretch: Stretch, q: int, size: int) -> None:
-        graph = algebra.graph
-        self.algebra, make, number = algebra, graph.make, graph.number
-        total = [[number(int(i == j)) for j in range(size)] for i in range(size)]
+    def __init__(self, graph: Graph, stretch: Stretch, q: Node, size: int) -> None:
+        self.graph, total = graph, identity(size, graph.number)
         if stretch.S and stretch.L is not None:
-            square = make("sqr", q)
-            tau = make("div", square, make("sub", number(stretch.L**2), square))
+            tau = q * q / (stretch.L**2 - q * q)
             for j, S in enumerate(stretch.S, start=1):
-                part = [[make("mul", number(v), graph.power(tau, j)) for v in row] for row in S]
-                total = algebra.each("add", total, part)
-        slope = graph.tangents([v for row in total for v in row], {q: number(1)})
-        self.total, self.slope = total, [slope[i * size : (i + 1) * size] for i in range(size)]
+                total = total + graph.numbers(S) * graph.power(tau, j)
+        slope = graph.tangents(total.ravel(), {q: graph.number(1)})
+        self.total, self.slope = total, np.array(slope, dtype=object).reshape(size, size)
 
-    def value(self, V: Function, c: Nodes, c_dot: Nodes) -> list[int]:
+    def value(self, V: Function, c: Array, c_dot: Array | None = None) -> list[Node]:
         """V, |G c|² and, where ċ is given, V̇."""
-        graph, algebra = self.algebra.graph, self.algebra
-
-        def times(A: Matrix, v: Nodes) -> list[int]:
-            return [r[0] for r in algebra.times([[graph.number(a) for a in r] for r in A], v)]
-
-        z = times(V.A, c)
-        terms = dict(zip(V.exponents, V.coefficients, strict=True))
-        value = _polynomial(graph, z, terms)
-        guard = graph.sum(graph.make("sqr", v) for v in times(V.G, c))
-        seeds = dict(zip(z, times(V.A, c_dot), strict=True)) if c_dot else {}
+        graph, A = self.graph, self.graph.numbers(V.A)
+        z = A @ c
+        value = _polynomial(graph, z, dict(zip(V.exponents, V.coefficients, strict=True)))
+        guard = sum(v * v for v in graph.numbers(V.G) @ c)
+        seeds = {} if c_dot is None else dict(zip(z, A @ c_dot, strict=True))
         return [value, guard, *(graph.tangents([value], seeds) if seeds else [])]
 
 
-def _polynomial(graph: Graph, z: Sequence[int], terms: Mapping[tuple[int, ...], Fraction]) -> int:
+def _polynomial(graph: Graph, z: Array, terms: Mapping[tuple[int, ...], Fraction]) -> Node:
     """Lay Σ coefficient · Π z_i^e_i by Horner's scheme, one variable after the other."""
-    if not z:
+    if not len(z):
         return graph.number(terms[()])
-    total: int | None = None
+    total: Any = None
     for power in range(max(e[0] for e in terms), -1, -1):
         rest = {e[1:]: c for e, c in terms.items() if e[0] == power}
-        parts = [] if total is None else [graph.make("mul", total, z[0])]
-        parts += [_polynomial(graph, z[1:], rest)] if rest else []
-        total = graph.sum(parts)
-    assert total is not None
+        part = _polynomial(graph, z[1:], rest) if rest else 0
+        total = part if total is None else total * z[0] + part
+    assert isinstance(total, Node)
     return total
 
 
 def _motion(
-    algebra: Algebra, model: Model, law: Law, y: Nodes, p: Sequence[int]
-) -> tuple[Nodes, list[int]]:
+    graph: Graph, model: Model, law: Law, y: Array, p: Sequence[Node]
+) -> tuple[Array, list[Node]]:
     """ẏ of the motion on the surface, y = (q_u, v_u, w), and the pivots of M."""
-    graph, free = algebra.graph, model.n - model.m
-    lambda_a, lambda_u = (
-        [[graph.number(v) for v in row] for row in block] for block in (law.lambda_a, law.lambda_u)
-    )
-    ratio = algebra.times(algebra.inverse(lambda_a)[0], lambda_u)
-    q_u, v_u, w = y[:free], y[free : 2 * free], y[2 * free :]
-    q = [*algebra.each("sub", w, algebra.times(ratio, q_u)), *q_u]
-    on = Sliding.of(algebra, model, law, q, algebra.times(lambda_a, w), v_u, p)
-    w_dot = algebra.each("add", on.v_a, algebra.times(ratio, v_u))
-    return [*v_u, *on.v_u_dot, *w_dot], on.pivots
+    free = model.n - model.m
+    lambda_a = graph.numbers(law.lambda_a)
+    ratio = inverse(lambda_a)[0] @ graph.numbers(law.lambda_u)
+    q_u, v_u, w = np.split(y, [free, 2 * free])
+    q = np.concatenate([w - ratio @ q_u, q_u])
+    on = Sliding.of(graph, model, law, q, lambda_a @ w, v_u, p)
+    return np.concatenate([v_u, on.v_u_dot, on.v_a + ratio @ v_u]), on.pivots
 
 
 def on_the_line(stretch: Stretch, V: Function, end: Sequence[Fraction], max_boxes: int) -> Settled:
     """Decide whether V ≤ 1 and |G c| ≤ 1 on the line from 0 to a point y."""
     graph = Graph(1)
-    algebra = Algebra(graph)
-    y = [[graph.make("mul", graph.inputs[0], graph.number(v))] for v in end]
-    chart = _Chart(algebra, stretch, y[0][0], len(y))
-    nodes = chart.value(V, algebra.times(chart.total, y), [])
-    goals = [Goal(f"{what} ≤ 1 on the line", -1, (-1.0, -1.0), False) for what in ("V", "|G c|²")]
+    y = graph.inputs[0] * graph.numbers(end)
+    chart = _Chart(graph, stretch, y[0], len(y))
+    nodes = chart.value(V, chart.total @ y)
+    most = ops.point(-1.0)  # V ≤ 1 as −V ≥ −1
+    goals = [Goal(f"{what} ≤ 1 on the line", -1, most, False) for what in ("V", "|G c|²")]
     box = [(Fraction(0), Fraction(1))]
-    return settle(graph.program(nodes), box, np.empty((0, 2)), goals, max_boxes)
+    return settle(graph.program(nodes), box, np.empty(0, dtype=complex), goals, max_boxes)
 
 
 class Stage:
@@ -138,47 +126,40 @@ class Stage:
         self.size = size = 2 * model.n - model.m
         self.inner, self.plant = inner, [plant[p.name] for p in model.parameters if p.name in plant]
         self.graph = graph = Graph(size + len(self.plant))
-        algebra, make, number = Algebra(graph), graph.make, graph.number
         varied = iter(graph.inputs[size:])
-        p = [next(varied) if k.name in plant else number(k.value or 0) for k in model.parameters]
+        own = [(k, graph.number(k.value or 0)) for k in model.parameters]
+        p = [next(varied) if k.name in plant else value for k, value in own]
         self.half = half = stretch.reach(V.G[0][0])
         top = Fraction(0) if half is None else stretch.first(half)
         chord = Fraction(1) if half is None else top / half
         self.sides = [half or 0, *(1 + abs(row[0]) * (top - (half or 0)) for row in V.G[1:])]
         q = graph.inputs[0]
-        chart = _Chart(algebra, stretch, q, size)
-        c = [make("mul", chart.total[0][0], q)]
+        chart = _Chart(graph, stretch, q, size)
+        c = [chart.total[0, 0] * q]
         for r in range(1, size):
-            known = [make("mul", number(V.G[r][j] / V.G[r][r]), c[j]) for j in range(1, r)]
-            known.append(make("mul", number(V.G[r][0] * chord / V.G[r][r]), q))
-            own = make("mul", number(1 / V.G[r][r]), graph.inputs[r])
-            c.append(make("sub", own, graph.sum(known)))
-        right = [[make("sub", c[r], make("mul", chart.total[r][0], q))] for r in range(1, size)]
-        rest, _ = algebra.inverse([row[1:] for row in chart.total[1:]])
-        y = [[q], *algebra.times(rest, right)]
-        y_dot, self.pivots = _motion(algebra, model, law, y, p)
-        bend = [[make("mul", v[0], y_dot[0][0])] for v in algebra.times(chart.slope, y)]
-        c_dot = algebra.each("add", algebra.times(chart.total, y_dot), bend)
-        column = [[v] for v in c]
+            known = [V.G[r][j] / V.G[r][r] * c[j] for j in range(1, r)]
+            known.append(V.G[r][0] * chord / V.G[r][r] * q)
+            c.append(1 / V.G[r][r] * graph.inputs[r] - sum(known))
+        column = np.array(c, dtype=object)
+        rest, _ = inverse(chart.total[1:, 1:])
+        y = np.array([q, *(rest @ (column[1:] - chart.total[1:, 0] * q))], dtype=object)
+        y_dot, self.pivots = _motion(graph, model, law, y, p)
+        c_dot = chart.total @ y_dot + chart.slope @ y * y_dot[0]
         value, guard, self.rate = chart.value(V, column, c_dot)
-        before = [] if inner is None else chart.value(inner, column, [])
-        self.rates = [row[0] for row in y_dot]
+        before = [] if inner is None else chart.value(inner, column)
+        self.rates = list(y_dot)
         nodes = [self.rate, value, *before[:1], guard, *before[1:], *self.pivots]
-        self.program, self.y = graph.program(nodes), graph.program([row[0] for row in y])
+        self.program, self.y = graph.program(nodes), graph.program(list(y))
         self.even = all(0 in p for p in graph.parities(nodes, size))
 
     def decide(self, max_boxes: int) -> Settled:
         """Decide (1) to (3) of the statement for this function."""
-        try:
-            at = [Span(0)] * self.size + [Span(*ends) for ends in self.plant]
-            if not all(v.zero for v in self.graph.exact(self.rates, at)):
-                return Settled("undecided", "F(0) = 0 is not shown exactly", (), 0)
-        except ArithmeticError as error:
-            return Settled("undecided", f"at the target: {error}", (), 0)
+        at = [Span(0)] * self.size + [Span(*ends) for ends in self.plant]
+        if why := self.graph.not_zero(self.rates, at, "F(0) = 0"):
+            return Settled("undecided", why, (), 0)
         if self.half is None:
             return Settled("undecided", "the guard reaches the pole", (), 0)
-        side = np.array([hull(Fraction(v), Fraction(v))[1] for v in self.sides])
-        ends = np.array([hull(*e) for e in self.plant]).reshape(-1, 2)
+        side, ends = ops.hulls(self.sides).imag, ops.ends(self.plant)
         core = np.zeros(self.size)
         if self.inner is None:
             found = self._core(0.25 * side, ends)
@@ -199,9 +180,9 @@ class Stage:
         ]
 
         def falls(part: FloatArray) -> bool:
-            low, high = np.append(-cube, part[:, 0]), np.append(cube, part[:, 1])
-            H = slope(low, high, N)[:, 1:]
-            return bool((pivots(low, high)[:, 0, 0] > 0).all()) and _negative_definite(H)
+            box = ops.between(np.append(-cube, part[:, 0]), np.append(cube, part[:, 1]))
+            H = slope(box, N)[:, 1:]
+            return bool((pivots(box).real > 0).all()) and _negative_definite(H)
 
         for _ in range(24):
             if all(falls(part) for part in slices):
@@ -211,13 +192,13 @@ class Stage:
 
     def _false(self, a: FloatArray) -> str:
         """What is false for certain at a point, if anything."""
-        values = self.program(a, a)[:, 0]
+        values = self.program(ops.between(a, a))[:, 0]
         count = 2 if self.inner is None else 3
-        outside = self.inner is None or values[2, 0] > 1.0
-        if values[1, 1] <= 1.0 and values[count, 1] <= 1.0:
-            if outside and values[0, 0] > 0.0:
+        outside = self.inner is None or values[2].real > 1.0
+        if values[1].imag <= 1.0 and values[count].imag <= 1.0:
+            if outside and values[0].real > 0.0:
                 return "V̇ < 0"
-            if (values[-len(self.pivots) :, 1] <= 0.0).any():
+            if (values[-len(self.pivots) :].imag <= 0.0).any():
                 return "M ≻ 0"
         return ""
 
@@ -229,7 +210,7 @@ class Stage:
         program: Program = self.program
         models = ops.models(program.code, program.constants, program.outputs, a, b)
         values, spread = ops.ranges(models, V)
-        low, high = values[..., 0], values[..., 1]
+        low, high = values.real, values.imag
         count = 2 if self.inner is None else 3  # then the guards
         ring = models[:, :3].copy()
         if self.inner is None:
@@ -278,17 +259,18 @@ class Stage:
         return Settled("proved", "", (), count)
 
     def _named(self, point: FloatArray) -> tuple[float, ...]:
-        return (*self.y(point, point)[:, 0].mean(axis=1).tolist(), *point[self.size :].tolist())
+        y = self.y(ops.between(point, point))[:, 0]
+        return (*(0.5 * (y.real + y.imag)).tolist(), *point[self.size :].tolist())
 
 
-def _negative_definite(H: FloatArray) -> bool:
-    """Whether every symmetric matrix in H (N, N, 2) is: −Sᵀ H S ≻ 0, then S is invertible too."""
-    middle = 0.5 * (H[..., 0] + H[..., 1])
+def _negative_definite(H: Intervals) -> bool:
+    """Whether every symmetric matrix in H (N, N) is: −Sᵀ H S ≻ 0, then S is invertible too."""
+    middle = 0.5 * (H.real + H.imag)
     if not np.isfinite(middle).all():
         return False
     values, vectors = np.linalg.eigh(-0.5 * (middle + middle.T))
     if not values[0] > 0:
         return False
     S = ops.points(vectors / np.sqrt(values))
-    turned = ops.product(ops.product(np.ascontiguousarray(S.transpose(1, 0, 2)), H), S)
-    return bool(ops.dominance(np.ascontiguousarray(-turned[..., ::-1])) > 0.0)
+    turned = ops.product(ops.product(np.ascontiguousarray(S.T), H), S)
+    return bool(ops.dominance(ops.between(-turned.imag, -turned.real)) > 0.0)

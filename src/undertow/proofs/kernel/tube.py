@@ -10,16 +10,24 @@ found, the step.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
 
 from undertow.proofs.kernel import compiled as ops
-from undertow.proofs.kernel.graph import NOWHERE, FloatArray, Graph, Program
-
-Pair = tuple[FloatArray, FloatArray]
+from undertow.proofs.kernel.graph import (
+    NOWHERE,
+    FloatArray,
+    Graph,
+    Intervals,
+    Node,
+    Pair,
+    Program,
+    Sides,
+    corners,
+)
 
 #: Coefficients of a step, the part of a step that may have a corner inside, and the shortest.
 ORDER, SHORT, SHORTEST = 12, 2.0**-5, 2.0**-10
@@ -37,35 +45,32 @@ class Field:
     A max or min of it has two sides; where both are possible it stays in the piece.
     """
 
-    def __init__(self, graph: Graph, rates: Sequence[int]) -> None:
+    def __init__(self, graph: Graph, rates: Sequence[Node]) -> None:
         self._graph, self._rates, self._pieces = graph, rates, dict[bytes, Program]()
-        self._corners = graph.corners(rates)
+        self._corners = corners(rates)
         self.whole = graph.program(rates)
-        self.gaps = graph.program([graph.make("sub", *graph.nodes[k][1:]) for k in self._corners])
+        self.gaps = graph.program([k.of[0] - k.of[1] for k in self._corners])
 
-    def piece(self, gaps: FloatArray) -> tuple[Program, bool]:
-        """Return the rates where the gaps of corners lie in (K, 2), and whether all are decided."""
-        first, second = gaps[:, 0] >= 0.0, gaps[:, 1] <= 0.0
+    def piece(self, gaps: Intervals) -> tuple[Program, bool]:
+        """Return the rates where the gaps of corners lie in (K,), and whether all are decided."""
+        first, second = gaps.real >= 0.0, gaps.imag <= 0.0
         key = first.tobytes() + second.tobytes()
         if key not in self._pieces:
-            sides = dict[int, int]()
-            for k, a, b in zip(self._corners, first, second, strict=True):
-                kind, x, y = self._graph.nodes[k]
-                if a or b:
-                    sides[k] = x if a == (kind == "max") else y
+            ends = zip(self._corners, first, second, strict=True)
+            sides = {k: k.of[int(a != (k.kind == "max"))] for k, a, b in ends if a or b}
             self._pieces[key] = self._graph.program(self._rates, sides)
         return self._pieces[key], bool((first | second).all())
 
-    def advance(self, tube: Tube, h: float, order: int = ORDER) -> FloatArray | None:
+    def advance(self, tube: Tube, h: float, order: int = ORDER) -> Intervals | None:
         """Move a set on by h, in shorter steps where one is not shown.
 
         Returns
         -------
         ndarray or None
-            A box that all motions stay in on the way, (N, 2); None where they may leave the domain
+            A box that all motions stay in on the way, (N,); None where they may leave the domain
             of F, or no bounds are found.
         """
-        whole: FloatArray | None = None
+        whole: Intervals | None = None
         done, part = 0.0, 1.0
         while done < 1.0:  # parts are powers of two: h · part and their sum are exact
             stay = self._step(tube, h * part, order, part <= SHORT)
@@ -75,35 +80,34 @@ class Field:
                     return None
                 continue
             whole = stay if whole is None else whole
-            low, high = np.minimum(whole[:, 0], stay[:, 0]), np.maximum(whole[:, 1], stay[:, 1])
-            whole = np.column_stack([low, high])
+            low, high = np.minimum(whole.real, stay.real), np.maximum(whole.imag, stay.imag)
+            whole = ops.between(low, high)
             done += part
             while part < 1.0 and done % (2.0 * part) == 0.0:
                 part *= 2.0
         return whole
 
-    def _step(self, tube: Tube, h: float, order: int, short: bool) -> FloatArray | None:
+    def _step(self, tube: Tube, h: float, order: int, short: bool) -> Intervals | None:
         """Move a set on by h; the box that motions stay in, or None where nothing is shown."""
         X, n = tube.hull, len(tube.m)
         stay = _stay(self.whole, X, tube.fixed, h)
         if stay is None:
             return None
-        rates = _ends(self.whole, stay, tube.fixed)
-        way = ops.reached(np.zeros_like(X), rates, h).reshape(n, 1, 2)
-        gaps = expanded(self.gaps, stay, tube.m, tube.fixed)
+        box = np.concatenate([stay, tube.fixed])
+        way = ops.moved(np.zeros_like(X), self.whole(box)[:, 0], complex(0.0, h))[:, None]
+        gaps = self.gaps.expanded(stay, tube.m, tube.fixed)
         program, decided = self.piece(ops.along(*gaps, tube.C, tube.xi, way))
         if not decided and not short:
             return None
-        low, high = np.vstack([stay, tube.fixed]).T.copy()
-        rest = program.series(low, high, order)[:, order, 0]
+        rest = program.series(box, order)[:, order, 0]
         if np.isnan(rest).any():  # a corner is inside: the short formula, Clarke's derivatives
             order = 2
-            rest = program.series(low, high, order)[:, order, 0]
-        low[:n] = high[:n] = tube.m
-        centre = program.series(low, high, order - 1)[:, :, 0]
-        low[:n], high[:n] = X.T
-        around = program.series(low, high, order - 1, ops.points(np.eye(n)))
-        return stay if tube.move(rest, centre, around, np.array([h, h])) else None
+            rest = program.series(box, order)[:, order, 0]
+        centre = np.concatenate([ops.between(tube.m, tube.m), tube.fixed])
+        centre = program.series(centre, order - 1)[:, :, 0]
+        box = np.concatenate([X, tube.fixed])
+        around = program.series(box, order - 1, ops.points(np.eye(n)))
+        return stay if tube.move(rest, centre, around, ops.point(h)) else None
 
 
 class Sampled(NamedTuple):
@@ -112,18 +116,18 @@ class Sampled(NamedTuple):
     Parameters
     ----------
     u, u_m
-        Its values, (m, 2) each.
+        Its values, (m,) each.
     L, L_m
-        Its derivative on the set, which holds means of it too, and at m, (m N, 2) each, row by row.
+        Its derivative on the set, which holds means of it too, and at m, (m N,) each, row by row.
     D
-        The derivative of that one on the set, (m N, N, 2).
+        The derivative of that one on the set, (m N, N).
     """
 
-    u: FloatArray
-    u_m: FloatArray
-    L: FloatArray
-    L_m: FloatArray
-    D: FloatArray
+    u: Intervals
+    u_m: Intervals
+    L: Intervals
+    L_m: Intervals
+    D: Intervals
 
 
 class Held:
@@ -138,28 +142,28 @@ class Held:
         Nodes of F (N), by x and u, and of the law (m), by x.
     """
 
-    def __init__(self, graph: Graph, rates: Sequence[int], law: Sequence[int]) -> None:
+    def __init__(self, graph: Graph, rates: Sequence[Node], law: Sequence[Node]) -> None:
         self.N, self.m = N, m = len(rates), len(law)
         self.graph, self.law, of = graph, law, [*graph.inputs[:N], *graph.inputs[-m:]]
-        by = np.array(graph.inputs[N:-m]).reshape(N + m, N).T.tolist()
+        by = graph.inputs[N:-m].reshape(N + m, N).T
         columns = [graph.tangents(rates, dict(zip(of, column, strict=True))) for column in by]
         self.both = graph.program([*rates, *(c[i] for i in range(N) for c in columns)])
         self.flow, self.renewed = graph.program(rates), graph.program(law)
-        self.start = ops.points(np.eye(N)).reshape(-1, 2)
-        self._corners, self._pieces = graph.corners(law), dict[tuple[int, ...], Program]()
-        self.gaps = graph.program([graph.make("sub", *graph.nodes[k][1:]) for k in self._corners])
+        self.start = ops.points(np.eye(N)).ravel()
+        self._corners, self._pieces = corners(law), dict[tuple[int, ...], Program]()
+        self.gaps = graph.program([k.of[0] - k.of[1] for k in self._corners])
 
-    def by_states(self, nodes: Sequence[int], sides: Mapping[int, int] = NOWHERE) -> Program:
+    def by_states(self, nodes: Collection[Node], sides: Sides = NOWHERE) -> Program:
         """Return nodes, and their derivatives by x, row by row."""
         one, graph = self.graph.number(1), self.graph
         slopes = [graph.tangents(nodes, {x: one}, sides) for x in graph.inputs[: self.N]]
         return graph.program([*nodes, *(c[i] for i in range(len(nodes)) for c in slopes)], sides)
 
-    def fixed(self, u: FloatArray | None = None, L: FloatArray | None = None) -> FloatArray:
+    def fixed(self, u: Intervals | None = None, L: Intervals | None = None) -> Intervals:
         """Return the inputs besides x, where Z does not matter, nor what is not given."""
-        none = np.zeros((self.m * (self.N + 1), 2))
+        none = np.zeros(self.m * (self.N + 1), dtype=complex)
         rest = none[: self.m] if u is None else u
-        return np.vstack([self.start, none[self.m :] if L is None else L, rest])
+        return np.concatenate([self.start, none[self.m :] if L is None else L, rest])
 
     def input(self, tube: Tube) -> Sampled:
         """Enclose the law on a set.
@@ -167,76 +171,75 @@ class Held:
         Where several pieces of the law may be met, derivatives are those of all, for a mean may be
         of several, and the same everywhere.
         """
-        none, options, slopes = self.fixed(), list[list[int]](), list[FloatArray]()
-        gaps = ops.along(*expanded(self.gaps, tube.hull, tube.m, none), *tube.parts)
-        for (low, high), k in zip(gaps, self._corners, strict=True):
-            larger = 2 if self.graph.nodes[k][0] == "max" else 1  # where the gap is below 0
-            options.append([larger] if high <= 0.0 else [3 - larger] if low >= 0.0 else [1, 2])
+        none, options, slopes = self.fixed(), list[list[int]](), list[Intervals]()
+        gaps = ops.along(*self.gaps.expanded(tube.hull, tube.m, none), *tube.parts)
+        for gap, k in zip(gaps, self._corners, strict=True):
+            larger = int(k.kind == "max")  # where the gap is below 0
+            sure = [larger] if gap.imag <= 0.0 else [1 - larger] if gap.real >= 0.0 else [0, 1]
+            options.append(sure)
         for piece in itertools.product(*options):
             if piece not in self._pieces:
-                pairs = zip(self._corners, piece, strict=True)
-                sides = {k: self.graph.nodes[k][i] for k, i in pairs}
+                sides = {k: k.of[i] for k, i in zip(self._corners, piece, strict=True)}
                 self._pieces[piece] = self.by_states(self.law, sides)
-            own, at = expanded(self._pieces[piece], tube.hull, tube.m, none)
+            own, at = self._pieces[piece].expanded(tube.hull, tube.m, none)
             slopes.append(ops.along(own, at, *tube.parts)[self.m :])
         every = np.array(slopes)
-        L = np.stack([every[..., 0].min(axis=0), every[..., 1].max(axis=0)], axis=-1)
+        L = ops.between(every.real.min(axis=0), every.imag.max(axis=0))
         L_m, D = at[self.m :], own[self.m :, 1:]
         if len(slopes) > 1:
             L_m, D = L, np.zeros_like(D)
-        around, centre = expanded(self.renewed, tube.hull, tube.m, none)
-        around[:, 1:] = L.reshape(self.m, self.N, 2)
+        around, centre = self.renewed.expanded(tube.hull, tube.m, none)
+        around[:, 1:] = L.reshape(self.m, self.N)
         return Sampled(ops.along(around, centre, *tube.parts), centre, L, L_m, D)
 
-    def _series(self, X: FloatArray, m: FloatArray, law: Sampled, order: int) -> Pair:
+    def _series(self, X: Intervals, m: FloatArray, law: Sampled, order: int) -> Pair:
         """Coefficients of (x, Z) on a box, with derivatives by where motions begin, and at m."""
-        nothing = np.zeros((len(self.start), self.N, 2))
-        seeds = [ops.points(np.eye(self.N)), nothing, law.D, law.L.reshape(self.m, self.N, 2)]
-        low, high = np.vstack([X, self.fixed(law.u, law.L)]).T.copy()
-        whole = self.both.series(low, high, order - 1, np.concatenate(seeds))
-        low, high = np.vstack([np.column_stack([m, m]), self.fixed(law.u_m, law.L_m)]).T.copy()
-        return whole, self.both.series(low, high, order - 1)[:, :, 0]
+        nothing = np.zeros((len(self.start), self.N))
+        seeds = [ops.points(np.eye(self.N)), nothing, law.D, law.L.reshape(self.m, self.N)]
+        box = np.concatenate([X, self.fixed(law.u, law.L)])
+        whole = self.both.series(box, order - 1, np.concatenate(seeds))
+        at = np.concatenate([ops.between(m, m), self.fixed(law.u_m, law.L_m)])
+        return whole, self.both.series(at, order - 1)[:, :, 0]
 
-    def advance(self, tube: Tube, h: FloatArray) -> FloatArray | None:
-        """Move a set of x on by a period, whose ends are h (2,), in one step.
+    def advance(self, tube: Tube, h: complex) -> Intervals | None:
+        """Move a set of x on by a period, enclosed by h, in one step.
 
         Returns
         -------
         ndarray or None
-            A box that all motions stay in on the way, (N, 2); None where they may leave the domain
+            A box that all motions stay in on the way, (N,); None where they may leave the domain
             of F or the law, or no bounds are found.
         """
         n, order, law = self.N, _order(h), self.input(tube)
         fixed = self.fixed(law.u)
-        stay = _stay(self.flow, tube.hull, fixed, h[1]) if np.isfinite(law.L).all() else None
+        stay = _stay(self.flow, tube.hull, fixed, h.imag) if np.isfinite(law.L).all() else None
         if stay is None:
             return None
-        low, high = np.vstack([stay, fixed]).T.copy()
-        rest = self.flow.series(low, high, order)[:, order, 0]
+        rest = self.flow.series(np.concatenate([stay, fixed]), order)[:, order, 0]
         whole, at = self._series(tube.hull, tube.m, law, order)
-        part = whole[n:].reshape(-1, 1 + n, 2).copy()
-        part[:, 1:] *= 0.5  # of the derivative's change, on the way
-        around = np.zeros((n, order, 1 + n, 2))
-        Z = ops.along(part, at[n:].reshape(-1, 2), *tube.coarse).reshape(n, n, order, 2)
-        around[:, :, 1:] = Z.transpose(0, 2, 1, 3)
+        part = whole[n:].reshape(-1, 1 + n).copy()
+        half = part[:, 1:]  # of the derivative's change, on the way
+        part[:, 1:] = ops.between(0.5 * half.real, 0.5 * half.imag)
+        around = np.zeros((n, order, 1 + n), dtype=complex)
+        Z = ops.along(part, at[n:].ravel(), *tube.coarse).reshape(n, n, order)
+        around[:, :, 1:] = Z.transpose(0, 2, 1)
         return stay if tube.move(rest, at[:n], around, h) else None
 
-    def derivative(self, X: FloatArray, m: FloatArray, law: Sampled, h: FloatArray) -> Pair | None:
-        """Enclose the derivative of x(h) by x(0) on a box X with a point m, (N, N, 2).
+    def derivative(self, X: Intervals, m: FloatArray, law: Sampled, h: complex) -> Pair | None:
+        """Enclose the derivative of x(h) by x(0) on a box X with a point m, (N, N).
 
         Also: a box that motions stay in.
         """
-        n, order, fixed = self.N, _order(h), np.vstack([law.L, law.u])
-        stay = _stay(self.both, np.vstack([X, self.start]), fixed, h[1])
+        n, order, fixed = self.N, _order(h), np.concatenate([law.L, law.u])
+        stay = _stay(self.both, np.concatenate([X, self.start]), fixed, h.imag)
         if stay is None:
             return None
-        low, high = np.vstack([stay, fixed]).T.copy()
-        end = self.both.series(low, high, order)[n:, order, 0]
+        end = self.both.series(np.concatenate([stay, fixed]), order)[n:, order, 0].copy()
         whole, at = self._series(X, m, law, order)
         for k in reversed(range(order)):
-            own, _ = ops.mean_values(whole[n:, k].copy(), at[n:, k].copy(), *X.T.copy(), m)
-            end = ops.carried(end, own, h)
-        return end.reshape(n, n, 2), stay[:n]
+            own, _ = ops.mean_values(whole[n:, k].copy(), at[n:, k].copy(), X, m)
+            end = ops.moved(own, end, h)
+        return end.reshape(n, n), stay[:n]
 
 
 @dataclass
@@ -246,55 +249,56 @@ class Tube:
     Parameters
     ----------
     fixed
-        Enclosures of the inputs besides states, (F, 2).
+        Enclosures of the inputs besides states, (F,).
     hull
-        A box around the set now, (N, 2).
+        A box around the set now, (N,).
     """
 
-    fixed: FloatArray
-    hull: FloatArray
+    fixed: Intervals
+    hull: Intervals
     m: FloatArray
     C: FloatArray
-    xi: FloatArray
+    xi: Intervals
 
     @classmethod
-    def of(cls, fixed: FloatArray, box: FloatArray) -> Self:
+    def of(cls, fixed: Intervals, box: FloatArray) -> Self:
         """Start from a box of doubles, (N, 2)."""
-        middle = 0.5 * box[:, 0] + 0.5 * box[:, 1]
-        xi = [ops.add(a, b, -v, -v) for (a, b), v in zip(box, middle, strict=True)]
-        return cls(fixed, box.copy(), middle, np.eye(len(box)), np.array(xi)[:, None])
+        hull, m = ops.between(*box.T), 0.5 * box[:, 0] + 0.5 * box[:, 1]
+        xi = [ops.add(x, ops.point(-v)) for x, v in zip(hull, m, strict=True)]
+        return cls(fixed, hull, m, np.eye(len(box)), np.array(xi)[:, None])
 
     def values(self, program: Program) -> Pair:
-        """Enclose values and derivatives over the hull, (O, 1 + N, 2), and values at m, (O, 2)."""
-        return expanded(program, self.hull, self.m, self.fixed)
+        """Enclose values and derivatives over the hull, (O, 1 + N), and values at m, (O,)."""
+        return program.expanded(self.hull, self.m, self.fixed)
 
-    def image(self, program: Program) -> FloatArray:
-        """Enclose values on the set, (O, 2)."""
+    def image(self, program: Program) -> Intervals:
+        """Enclose values on the set, (O,)."""
         return np.asarray(ops.along(*self.values(program), *self.parts))
 
     def map(self, program: Program) -> bool:
         """Replace the set by its image; whether that is bounded."""
         around, centre = self.values(program)
-        return self.move(np.zeros_like(self.hull), centre[:, None], around[:, None], np.ones(2))
+        return self.move(np.zeros_like(self.hull), centre[:, None], around[:, None], ops.point(1.0))
 
     def restrict(self, k: int, low: float, high: float) -> None:
         """Let coordinate k be anywhere in [low, high], the others be as they are."""
         m, C, box, one = self.m.copy(), self.C.copy(), self.hull.copy(), np.eye(len(self.m), 1, -k)
-        m[k], C[k], box[k] = 0.5 * low + 0.5 * high, 0.0, (low, high)
+        m[k], C[k], box[k] = 0.5 * low + 0.5 * high, 0.0, complex(low, high)
         self.m, self.C, self.hull = m, np.hstack([C, one]), box
-        self.xi = np.concatenate([self.xi, [[ops.add(low, high, -m[k], -m[k])]]])
+        self.xi = np.concatenate([self.xi, [[ops.add(box[k], ops.point(-m[k]))]]])
 
     @property
-    def parts(self) -> tuple[FloatArray, ...]:
+    def parts(self) -> tuple[FloatArray, Intervals, Intervals]:
         """C and ξ, and no more: the set around m."""
-        return self.C, self.xi, np.zeros((len(self.m), 1, 2))
+        return self.C, self.xi, np.zeros((len(self.m), 1), dtype=complex)
 
     @property
-    def coarse(self) -> tuple[FloatArray, ...]:
+    def coarse(self) -> tuple[FloatArray, Intervals, Intervals]:
         """A set of few columns around this one, in place of :attr:`parts`."""
-        return *_folded(self.C, self.xi, FEW_COLUMNS), np.zeros((len(self.m), 1, 2))
+        C, xi = _folded(self.C, self.xi, FEW_COLUMNS)
+        return C, xi, np.zeros((len(self.m), 1), dtype=complex)
 
-    def move(self, rest: FloatArray, centre: FloatArray, around: FloatArray, h: FloatArray) -> bool:
+    def move(self, rest: Intervals, centre: Intervals, around: Intervals, h: complex) -> bool:
         """Replace the set by what a step makes of it, if that is bounded (Lemma 6)."""
         m, C = self.m.copy(), self.C.copy()
         added = ops.taylor_step(rest, centre, around, h, m, C, self.xi)
@@ -308,11 +312,11 @@ class Tube:
         return True
 
 
-def _folded(C: FloatArray, xi: FloatArray, kept: int) -> Pair:
+def _folded(C: FloatArray, xi: Intervals, kept: int) -> tuple[FloatArray, Intervals]:
     """Leave the columns of a set that are the most of its width somewhere; a box for the others."""
     if C.shape[1] <= kept + len(C):
         return C, xi
-    part = np.abs(C) * np.abs(xi).max(axis=-1).T
+    part = np.abs(C) * np.maximum(np.abs(xi.real), np.abs(xi.imag)).T
     size = (part / (part.sum(axis=1, keepdims=True) + 1e-300)).max(axis=0)
     order = np.argsort(-size, kind="stable")
     most, others = np.sort(order[:kept]), order[kept:]
@@ -320,38 +324,30 @@ def _folded(C: FloatArray, xi: FloatArray, kept: int) -> Pair:
     return np.hstack([C[:, most], np.eye(len(C))]), np.concatenate([xi[most], box])
 
 
-def _stay(program: Program, X: FloatArray, fixed: FloatArray, h: float) -> FloatArray | None:
-    """A box that motions from X stay in for h (Lemma 6), (N, 2), or None."""
+def _stay(program: Program, X: Intervals, fixed: Intervals, h: float) -> Intervals | None:
+    """A box that motions from X stay in for h (Lemma 6), (N,), or None."""
+
+    def rates(box: Intervals) -> Intervals:
+        return program(np.concatenate([box, fixed]))[:, 0]
+
     stay = X.copy()
     for attempt in range(12):
-        reach = ops.reached(X, _ends(program, stay, fixed), h)
+        reach = ops.moved(X, rates(stay), complex(0.0, h))
         if not np.isfinite(reach).all():
             return None
-        left = np.column_stack([reach[:, 0] < stay[:, 0], reach[:, 1] > stay[:, 1]])
+        left = np.column_stack([reach.real < stay.real, reach.imag > stay.imag])
         for i, side in zip(*np.nonzero(left), strict=True) if attempt else ():
             face = stay.copy()
-            face[i] = stay[i, side]
-            rate = _ends(program, face, fixed)[i]
-            left[i, side] = not (rate[1] < 0.0 if side else rate[0] > 0.0)
+            face[i] = ops.point(stay[i].imag if side else stay[i].real)
+            rate = rates(face)[i]
+            left[i, side] = not (rate.imag < 0.0 if side else rate.real > 0.0)
         if not left.any():
             return stay
-        room = (0.1 if attempt < 6 else 0.5) * (reach[:, 1] - reach[:, 0]) + 1e-300
-        wider = np.column_stack([reach[:, 0] - room, reach[:, 1] + room])
-        stay = np.where(left, wider, stay)
+        room = (0.1 if attempt < 6 else 0.5) * (reach.imag - reach.real) + 1e-300
+        low = np.where(left[:, 0], reach.real - room, stay.real)
+        stay = ops.between(low, np.where(left[:, 1], reach.imag + room, stay.imag))
     return None
 
 
-def _order(h: FloatArray) -> int:
-    return HELD_ORDER if h[1] < 1.0001e-3 else LONG_ORDER
-
-
-def _ends(program: Program, box: FloatArray, fixed: FloatArray) -> FloatArray:
-    """Enclose values over a box of the first inputs, (O, 2)."""
-    low, high = np.vstack([box, fixed]).T.copy()
-    return program(low, high)[:, 0]
-
-
-def expanded(program: Program, box: FloatArray, m: FloatArray, fixed: FloatArray) -> Pair:
-    """Enclose values and derivatives over a box, (O, 1 + N, 2), and values at m, (O, 2)."""
-    low, high = np.vstack([box, fixed]).T.copy()
-    return program(low, high, len(m)), _ends(program, np.column_stack([m, m]), fixed)
+def _order(h: complex) -> int:
+    return HELD_ORDER if h.imag < 1.0001e-3 else LONG_ORDER

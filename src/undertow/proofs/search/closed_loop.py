@@ -26,6 +26,7 @@ from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.claims import STEP
+from undertow.proofs.kernel.compiled import between
 from undertow.proofs.kernel.loop import MOST_OF_ONE, ContinuousLoop, HeldLoop, Loop, halves
 from undertow.proofs.kernel.model import Law, Model, scale_of, system
 from undertow.proofs.require import require
@@ -196,7 +197,7 @@ def prove_loop(
             limit=f"boxes down to {THINNEST:.2g} of what was asked for",
             remedy="Give smaller starts, or more time",
         )
-    found = LoopClaim(task.claim(known, part, cuts).data())
+    found = LoopClaim.of(task.claim(known, part, cuts))
     verdict = found.decide(mechanism, surface, law)
     return ProvedLoop(found, verdict, time.process_time() - started)
 
@@ -213,7 +214,7 @@ def _longest_line(task: _Task, loop: Loop, until: float, progress: Callable[[str
     weight = np.abs(task.surface.matrix[:, index]).max()
     width = min(reach / 32, 0.15 * float(np.min(task.law.layer)) / max(weight, 1e-12))
     edges, box = [0.0], np.zeros((len(task.model.states), 2))
-    parts, latest, patience = _sliced(task.box, 0), 0, int(PATIENCE / loop.step[1])
+    parts, latest, patience = _sliced(task.box, 0), 0, int(PATIENCE / loop.step.imag)
     while edges[-1] < reach and width > reach * THINNEST and time.process_time() < until:
         box[index] = edges[-1], min(edges[-1] + width, reach)
         there, most = True, 2 * latest + patience if len(edges) > 1 else MOST_OF_ONE
@@ -266,7 +267,7 @@ def _largest_box(task: _Task, loop: Loop, until: float, progress: Callable[[str]
             if odd:
                 edges[wide[0]] = np.concatenate([-edges[wide[0]][:0:-1], edges[wide[0]]])
             cuts = {names[j]: edges[j][1:-1].tolist() for j in wide if len(edges[j]) > 2}
-            done, most = (part, cuts), 2 * latest + int(PATIENCE / loop.step[1])
+            done, most = (part, cuts), 2 * latest + int(PATIENCE / loop.step.imag)
             progress(f"proved {part:.3g} of the box, by {len(pieces)} tubes")
             if part == 1.0:
                 break
@@ -412,11 +413,13 @@ def _map_at_target(loop: HeldLoop, plant: Sequence[float] = ()) -> FloatArray | 
     """The derivative of one plant's map from sample to sample at the target, in (q, D p, s)."""
     scale = np.ones(loop.size)
     scale[loop.model.n : loop.size - loop.model.m] = [float(v) for v in scale_of(loop.model)]
-    X = np.append(np.zeros(loop.size), plant)[:, None] + np.zeros(2)
+    x = np.append(np.zeros(loop.size), plant)
+    X = between(x, x)
     found = loop.held.derivative(X, *loop.slopes(X), loop.step)
     if loop.no_equilibrium or found is None:
         return None
-    J = found[0][: loop.size, : loop.size].mean(axis=-1)
+    own = found[0][: loop.size, : loop.size]
+    J = 0.5 * (own.real + own.imag)
     return np.asarray(scale[:, None] * J / scale)
 
 
@@ -455,7 +458,7 @@ def _held_search(loop: HeldLoop) -> EllipsoidSearch | None:
         why, found = loop.terminal()
         return min(found, 0.0) if why else found
 
-    return EllipsoidSearch.of(margin, A, C, layer, float(loop.step[1]))
+    return EllipsoidSearch.of(margin, A, C, layer, float(loop.step.imag))
 
 
 def _terminal(search: EllipsoidSearch, path: FloatArray) -> TerminalEllipsoid | None:

@@ -22,6 +22,7 @@ from undertow.proofs.claims.terminal_ellipsoid import (
     TerminalEllipsoid,
     prove,
 )
+from undertow.proofs.kernel.compiled import between
 
 #: Smallest semi-axes, relative to the largest, that are tried first.
 FLOORS = (0.02, 0.005, 0.001)
@@ -216,7 +217,7 @@ def search_for(
     gradients = at_target[:, 1:]
     n, rows = loop.n, loop.rows(numbers)
     A = np.vstack([np.eye(n, 2 * n, n), gradients[:n].mean(axis=-1)])
-    limits, centre = mechanism.input_limits, at_target[:, 0].copy()
+    limits, centre = mechanism.input_limits, between(*at_target[:, 0].T)
 
     def margin(candidate: TerminalEllipsoid) -> float:
         code, found, _ = prove(loop, numbers, rows, limits, candidate, centre)
