@@ -158,7 +158,7 @@ def _too_weak(loop: ClosedLoop) -> str:
     """What to do where the inputs cannot hold the mechanism at the target; empty where they can."""
     held = np.abs(holding_input(loop.mechanism))
     weak = [
-        f"{given.name} of {u:.3g} {given.unit}, and its limit is {limit:.3g}"
+        f"{given.name} of {f'{u:.3g} {given.unit}'.rstrip()}, and its limit is {limit:.3g}"
         for given, u, limit in zip(loop.mechanism.inputs, held, loop.input_limits, strict=True)
         if u >= limit
     ]
