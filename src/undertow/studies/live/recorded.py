@@ -113,7 +113,9 @@ def recorded_run(
     least = None
     with suppress(MissingExtraError, InfeasibleError):  # then there is none to compare with
         progress("the bound", 0.9)
-        least = bound(cascade.mechanism, cascade.objective, x0, intervals=INTERVALS)
+        least = bound(
+            cascade.mechanism, cascade.objective, x0, intervals=INTERVALS, guess=run.trajectory
+        )
     return of_run(run, cascade, sketch_named(name, mechanism), least)
 
 
