@@ -645,6 +645,11 @@ def test_task_beyond_the_actuator_is_infeasible() -> None:
         bound(rig, objective, rig.state(phi=ut.deg(41)), horizon=3.0, intervals=40)
 
 
+def test_degrees_that_are_taken_for_radians_are_pointed_out() -> None:
+    with pytest.raises(InfeasibleError, match=r"40 rad is 2292°.*undertow\.deg\(40\)"):
+        bound(pendulum(), ut.MinimumTime(), horizon=0.5, intervals=10, phi=40.0)
+
+
 def test_start_inside_the_terminal_set_costs_nothing() -> None:
     """‖x₀‖ ≤ ν: the answer is 0 at once, with the same fields."""
     rig = pendulum()

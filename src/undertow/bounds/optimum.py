@@ -17,7 +17,7 @@ from undertow.bounds.guesses import built_in, recorded
 from undertow.bounds.mesh import hermite
 from undertow.bounds.programme import Programme, Solution
 from undertow.closed_loop import Trajectory
-from undertow.models import FloatArray, Mechanism, StateLike
+from undertow.models import FloatArray, Mechanism, StateLike, in_degrees
 from undertow.objective import Objective
 
 
@@ -223,7 +223,8 @@ def bound(
             value="; ".join(failures),
             limit=f"a motion from x0 to ‖x‖ ≤ {objective.terminal_radius:g} "
             f"within {longest:g} s and the input limits",
-            remedy="Pass guess= a motion that arrives, try swing=True, or relax the limits",
+            remedy=in_degrees(mechanism.coordinates, mechanism.m, start)
+            or "Pass guess= a motion that arrives, try swing=True, or relax the limits",
         )
     return _bound(mechanism, replace(best, iterations=iterations), began)
 
