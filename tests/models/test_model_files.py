@@ -344,6 +344,10 @@ def test_a_rig_in_mujoco_stands_where_the_mechanism_does(pole: Path, mujoco: Any
         scene.write_text(plain.replace('<geom material="steel"/>', ""))
         rig: Any = rig_named(str(scene), recipe, supervised=False)
         at = origin(name)
+        own: Any = rig_named(
+            "mujoco", replace(recipe, mechanism=f"{scene}{word}"), supervised=False
+        )
+        assert own._data.qpos.tolist() == rig._data.qpos.tolist()
         assert rig._data.qpos.tolist() == pytest.approx([0.1, 0.2 + at["hinge"]])
         assert at["hinge"] == pytest.approx(math.pi - LEAN if word else -LEAN)
 
