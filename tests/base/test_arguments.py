@@ -333,3 +333,5 @@ def test_a_mapping_is_told_by_its_keys_and_values(rig: ut.Mechanism) -> None:
     with pytest.raises(InvalidInputError, match=r"a mapping of names to numbers.*SetPoints") as e:
         cascade.simulate(target="theta=1")  # type: ignore[arg-type]
     assert "in quotes" not in str(e.value)
+    with pytest.raises(InvalidInputError, match=r"a sequence of names\. Write \['x'\]"):
+        ut.modelling.from_urdf("<robot/>", actuated="x")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -90,6 +92,17 @@ def test_files_of_an_earlier_run_are_moved_not_lost(tmp_path: Path) -> None:
     assert write_files(tmp_path, {"a.txt": b"2", "b.txt": b"3"}) == tmp_path / "earlier-1"
     assert (tmp_path / "earlier-1" / "a.txt").read_bytes() == b"1"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.txt", "b.txt", "earlier-1"]
+
+
+def test_a_full_disk_names_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Claim: of a write that fails Python does not say where; the refusal does."""
+
+    def full(_self: Path, _content: bytes) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(ArtefactError, match=r"No space left .*out/a\.txt\)"):
+        write_files(tmp_path / "out", {"a.txt": b"1"})
 
 
 def test_an_unknown_name_is_refused_with_those_that_are_like_it() -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.integrate
+import scipy.interpolate
 import scipy.linalg
 import scipy.optimize
 import sympy as sp
@@ -283,6 +284,45 @@ def test_more_time_and_a_weaker_actuator_never_help_and_hurt() -> None:
     x0 = rig.state(phi=ut.deg(41))
     stronger = bound(rig.with_input_limit(20.0), ut.MinimumTime(), x0, intervals=40)
     assert stronger.cost < least_time(0.025, 41.0).cost
+
+
+@pytest.mark.slow
+def test_of_a_plant_that_swings_the_cheapest_swing_is_found() -> None:
+    """Two carts and a spring: the error costs, so that every half swing is a valley of the cost in
+    the final time; more time never costs more, and no closed loop costs less than the bound."""
+    x, y = ut.Coordinate("x", "m"), ut.Coordinate("y", "m")
+    plant = ut.Mechanism.from_energies(
+        "carts", [x, y], [ut.Input("push", "N", 5.0)],
+        kinetic=(x.velocity**2 + y.velocity**2) / 3, potential=4 * (x.symbol - y.symbol) ** 2,
+        dissipation=(x.velocity**2 + y.velocity**2) / 40, start={"y": 0.1},
+    )  # fmt: skip
+    objective = ut.objective_for(plant, "bench-energy", horizon=60.0)
+    costs = [bound(plant, objective, horizon=h, intervals=50).cost for h in (5.0, 12.0, 60.0)]
+    assert costs[1] <= costs[0] * (1 + 1e-3)
+    assert costs[2] <= costs[1] * (1 + 1e-3)
+    run = ut.Cascade(plant, objective).simulate(plant.start)
+    assert run.reached
+    assert costs[2] <= run.cost
+    assert bound(plant, objective, guess=run.trajectory, intervals=50).cost <= run.cost
+
+
+def test_a_motion_that_arrives_is_followed_to_the_optimum_beside_it() -> None:
+    """On a linear plant the optimum comes back, a little later; what stays away is no help."""
+    plant, objective = linear_plant(), ut.MinimumEnergy(terminal_radius=0.05)
+    x0 = np.array([1.0, -0.5, 0.2, 0.3])
+    found = bound(plant, objective, x0, horizon=4.0, intervals=20)
+    motion = Guess(
+        "motion",
+        found.time,
+        scipy.interpolate.make_interp_spline(found.t, found.x, k=1),
+        scipy.interpolate.make_interp_spline(found.t, found.u, k=1),
+    )
+    programme = Programme(ca, plant, objective, x0, 5.0)
+    near = programme.near(motion, 20)
+    assert near is not None
+    assert near.cost < found.cost  # it may take a little longer
+    assert near.time > found.time
+    assert programme.near(motion._replace(time=0.5 * found.time), 20) is None
 
 
 # -- the result checks itself -------------------------------------------------------------
@@ -603,6 +643,11 @@ def test_task_beyond_the_actuator_is_infeasible() -> None:
     objective = ut.MinimumEnergy(constraints=UPRIGHT)
     with pytest.raises(InfeasibleError, match=r"exponential decay.*guess="):
         bound(rig, objective, rig.state(phi=ut.deg(41)), horizon=3.0, intervals=40)
+
+
+def test_degrees_that_are_taken_for_radians_are_pointed_out() -> None:
+    with pytest.raises(InfeasibleError, match=r"40 rad is 2292°.*undertow\.deg\(40\)"):
+        bound(pendulum(), ut.MinimumTime(), horizon=0.5, intervals=10, phi=40.0)
 
 
 def test_start_inside_the_terminal_set_costs_nothing() -> None:

@@ -121,6 +121,7 @@ def test_version_and_bare_call() -> None:
         (("simulate", RIG, "--start", "phi=nandeg"), "'nandeg'", "a number with its unit"),
         (("simulate", RIG, "--start", "phi"), "'phi'", "name=value"),
         (("simulate", RIG, "--set", "m=-1"), "-1", "inside (0, inf) kg"),
+        (("simulate", RIG, "--set", "m=0.2kg"), "'0.2kg'", "the number alone"),
         (("simulate", RIG, "--set", "mass=1"), "'mass'", "d_e"),
         (("simulate", RIG, "--set", "m=nan"), "'nan'", "finite"),
         (("simulate", RIG, "--plant", "q=1"), "'q'", "one of"),

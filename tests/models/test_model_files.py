@@ -188,6 +188,21 @@ def test_servos_tendons_of_one_joint_frames_and_meshes(mujoco: Any) -> None:
     assert brake == pytest.approx(-0.1 - 0.5 * (3 * 2) ** 2)
 
 
+BRANCHES = """<mujoco><worldbody>
+  <body><joint axis="0 1 0"/><geom pos="0 0 .2" size=".1"/></body>
+  <body pos="0 1 0"><joint name="k" axis="0 1 0"/><geom pos="0 0 .5" size=".1"/>
+    <body pos="0 0 .5"><joint axis="0 1 0"/><geom pos="0 0 .5" size=".1"/></body></body>
+  <body><joint axis="1 0 0"/><geom pos="0 .3 .2" size=".1"/></body>
+</worldbody><actuator><motor joint="k"/></actuator></mujoco>"""
+
+
+def test_joints_without_names_in_several_branches(mujoco: Any) -> None:
+    """Claim: they are compared with MuJoCo's own, whose order is that of the file."""
+    read = modelling.from_mjcf(BRANCHES)
+    assert float(agreement(read)) < AGREEMENT
+    assert read.n == 4
+
+
 def test_what_mujoco_has_and_no_mechanism_can_have_is_refused(mujoco: Any) -> None:
     limited = POLE.replace('<include file="./common/look.xml"/>', "").replace(
         ' material="steel"', ""
@@ -201,6 +216,8 @@ def test_what_mujoco_has_and_no_mechanism_can_have_is_refused(mujoco: Any) -> No
          "</fixed></tendon><actuator>", "limits on tendon"),
         ('<body name="pole"', '<body name="pole" gravcomp="1"', "gravcomp"),
         ('joint="slider" gear="50"', 'joint="slider" gear="0"', "gear of actuator"),
+        ('ctrlrange="-3 3"', 'ctrlrange="-3 3" delay="0.02" nsample="4"', "'slide' that acts late"),
+        ("<worldbody>", '<asset><model name="m" file="robot.xml"/></asset><worldbody>', "to_xml"),
         ('name="hinge" range', 'name="hinge" strength="1" range', "unrecognized attribute"),
     ):  # fmt: skip
         assert old in limited
@@ -327,6 +344,10 @@ def test_a_rig_in_mujoco_stands_where_the_mechanism_does(pole: Path, mujoco: Any
         scene.write_text(plain.replace('<geom material="steel"/>', ""))
         rig: Any = rig_named(str(scene), recipe, supervised=False)
         at = origin(name)
+        own: Any = rig_named(
+            "mujoco", replace(recipe, mechanism=f"{scene}{word}"), supervised=False
+        )
+        assert own._data.qpos.tolist() == rig._data.qpos.tolist()
         assert rig._data.qpos.tolist() == pytest.approx([0.1, 0.2 + at["hinge"]])
         assert at["hinge"] == pytest.approx(math.pi - LEAN if word else -LEAN)
 
@@ -339,6 +360,27 @@ def test_an_equilibrium_that_the_inputs_cannot_hold_is_none(pole: Path) -> None:
     pole.write_text(text.replace('ctrlrange="-3 3"', 'ctrlrange="-.1 .1"'))
     with pytest.raises(ModelError, match="which the inputs hold within limits"):
         named(str(pole))
+
+
+def test_a_servo_rests_where_its_input_is_zero(pole: Path) -> None:
+    """Claim: on that slope a servo too weak to hold zero gives way until its spring bears the
+    cart, by (m + M) g sin(30 deg) / kp; where the travel does not reach there, what would hold
+    zero is said. Where zero is outside the travel, its middle is tried."""
+    text = POLE.replace("<worldbody>", '<option gravity="4.905 0 -8.496"/><worldbody>')
+    motor = '<motor name="slide" joint="slider" gear="50" ctrlrange="-3 3"/>'
+    servo = '<position name="slide" joint="slider" kp="20" ctrlrange="-.01 .01"/>'
+    pole.write_text(text.replace(motor, servo))
+    given = named(f"{pole}@hanging")
+    assert f"slider = {1.3 * 4.905 / 20:.4g} m, hinge = 149." in given.description
+    assert "held by" not in given.description
+    pole.write_text(text.replace(motor, servo.replace("20", "5")))
+    with pytest.raises(ModelError, match=r"none: slider = 0 m, .* takes slide = -1\.28, limited"):
+        named(str(pole))
+    pole.write_text(POLE.replace('range="-1 1"', 'range="1 3"'))
+    assert "slider = 2 m" in named(f"{pole}@upright").description
+    pole.write_text(POLE.replace('range="-80 200"', 'range="20 80"'))
+    with pytest.raises(ModelError, match=r"hinge = \S+ is outside the travel of hinge"):
+        named(f"{pole}@upright")
 
 
 def test_a_start_is_within_what_the_inputs_reach(pole: Path) -> None:
@@ -438,6 +480,32 @@ def test_a_urdf_as_people_have_it(tmp_path: Path) -> None:
     frozen = modelling.from_urdf(URDF.replace("</robot>", LIMB), frozen=["wrist"])
     same(frozen, modelling.from_urdf(URDF))
     assert frozen.n == 2
+
+
+def test_a_urdf_of_ros_2_and_one_that_xacro_is_yet_to_make() -> None:
+    """Claim: joints with a command interface are driven; macros that are left are refused, the
+    name of their space alone is not; a mimic joint may be frozen; products of inertia that are left
+    out are zero, in the comparison too."""
+    bare = URDF.replace('effort="30"', 'effort="0"').replace(' ixy="0" ixz="0"', "")
+    driven = """<ros2_control name="r" type="system"><joint name="slide">
+      <command_interface name="effort"/><state_interface name="position"/></joint>
+      <joint name="turn"><state_interface name="position"/></joint></ros2_control></robot>"""
+    read = modelling.from_urdf(bare.replace("</robot>", driven))
+    assert [c.name for c in read.coordinates] == ["slide", "turn"]
+    assert [i.name for i in read.inputs] == ["slide_force"]
+    if mujoco_compiler.engine():
+        assert float(agreement(read)) < AGREEMENT
+    space = URDF.replace("<robot", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"')
+    same(modelling.from_urdf(space), modelling.from_urdf(URDF))
+    for left in (space.replace("</robot>", '<xacro:arm n="2"/></robot>'),
+                 URDF.replace('<mass value="0.1"/>', '<mass value="${m}"/>')):  # fmt: skip
+        with pytest.raises(InvalidInputError, match=r"xacro FILE\.xacro > FILE\.urdf"):
+            modelling.from_urdf(left)
+    mimic = LIMB.replace("</joint>", '<mimic joint="turn"/></joint>')
+    with pytest.raises(ModelError, match=r"mimic.*frozen=\['wrist'\]"):
+        modelling.from_urdf(URDF.replace("</robot>", mimic))
+    still = modelling.from_urdf(URDF.replace("</robot>", mimic), frozen=["wrist"])
+    same(still, modelling.from_urdf(URDF))
 
 
 LIMB = """<link name="stick"/><joint name="wrist" type="continuous"><parent link="rail"/>

@@ -512,6 +512,8 @@ def test_actuated_joints_that_do_not_exist_are_refused() -> None:
         modelling.from_urdf(CART_URDF, actuated=["x", "phi"])
     with pytest.raises(InvalidInputError, match="effort"):
         modelling.from_urdf(CART_URDF, actuated=["x"], effort={"phi": 1.0})
+    with pytest.raises(InvalidInputError, match=r"effort .*got x.*with_input_limit"):
+        modelling.from_mjcf(CART_MJCF, effort={"x": 1.0})
     with pytest.raises(InvalidInputError, match="equilibrium"):
         modelling.from_urdf(CART_URDF, equilibrium={"psi": 1.0})
 

@@ -292,6 +292,9 @@ def test_only_proofs_become_claims() -> None:
 def test_unreadable_and_huge_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(ArtefactError, match="certificate"):
         read_certificate(tmp_path / "nothing.json")
+    (tmp_path / "other.py").write_text("import undertow")
+    with pytest.raises(CertificateError, match=r"other\.py': got no JSON"):
+        read_certificate(tmp_path / "other.py")
     huge = tmp_path / "huge.json"
     for size, said in ((LARGEST + 1, "at most"), (LARGEST, "JSON")):
         with huge.open("wb") as file:

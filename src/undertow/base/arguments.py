@@ -272,8 +272,11 @@ def _refuse(of: Any, parameter: str | None, value: object, name: str = "") -> No
     """
     hint = _hints(of)[str(parameter)]
     members = [m for m in _members(hint) if m is not types.NoneType]
-    names = (_name(m) for member in members for m in (member, *_contents(member)))
-    remedies = (REMEDIES.get(name) for name in names)
+    remedies: Iterable[str | None] = (
+        REMEDIES.get(_name(m)) for member in members for m in (member, *_contents(member))
+    )
+    if isinstance(value, str) and "a sequence of names" in map(_words, members):
+        remedies = [f"Write [{value!r}]"]
     raise InvalidInputError(
         f"{name or parameter} of {of.__qualname__}",
         value=_shown(value),

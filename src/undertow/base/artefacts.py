@@ -300,6 +300,7 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> Path | None:
     """
     check_folder(folder)
     try:
+        name = ""
         earlier = _keep_earlier(folder, files)
         for name, content in files.items():
             target = folder / name
@@ -309,7 +310,7 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> Path | None:
     except OSError as error:
         raise ArtefactError(
             f"results in '{folder}'",
-            value=f"{error.strerror} ({error.filename})",
+            value=f"{error.strerror} ({error.filename or folder / name})",
             limit="files that can be written",
             remedy="Free some space, or name another folder with --out",
         ) from error

@@ -17,7 +17,7 @@ from undertow.bounds.guesses import built_in, recorded
 from undertow.bounds.mesh import hermite
 from undertow.bounds.programme import Programme, Solution
 from undertow.closed_loop import Trajectory
-from undertow.models import FloatArray, Mechanism, StateLike
+from undertow.models import FloatArray, Mechanism, StateLike, in_degrees
 from undertow.objective import Objective
 
 
@@ -168,6 +168,8 @@ def bound(
     the terminal set until then pays for it, about ν² λ_max(P) with P of the linear-quadratic
     regulator of least effort, and may be cheaper when it ends where it arrives: 0.8 % from a
     pendubot's small angles.  Gains below 5e-4 of the cost are none: then t_f is the horizon.
+    Of a mechanism that swings about its target every swing has a valley of its own; they are
+    tried one by one.
 
     *Basins.*  The built-in guesses go straight to the target.  A mechanism may have other,
     far cheaper ways: a rotary pendulum at 41° that is let fall, swings through the bottom
@@ -197,11 +199,12 @@ def bound(
     candidates: list[Solution] = []
     failures: list[str] = []
     iterations = 0
-    for first in (*given, *built_in(mechanism, start, programme.scale, longest, swing)):
-        tried = programme.first(first, intervals)
+    guesses = (*given, *built_in(mechanism, start, programme.scale, longest, swing))
+    recordings = (programme.near(motion, intervals) for motion in given)
+    for tried in (*filter(None, recordings), *(programme.first(g, intervals) for g in guesses)):
         iterations += tried.iterations
         if tried.status is None:
-            failures.append(f"{first.name}: {tried.message}")
+            failures.append(f"{tried.name}: {tried.message}")
         else:
             candidates.append(tried)
     best: Solution | None = None
@@ -220,7 +223,8 @@ def bound(
             value="; ".join(failures),
             limit=f"a motion from x0 to ‖x‖ ≤ {objective.terminal_radius:g} "
             f"within {longest:g} s and the input limits",
-            remedy="Pass guess= a motion that arrives, try swing=True, or relax the limits",
+            remedy=in_degrees(mechanism.coordinates, mechanism.m, start)
+            or "Pass guess= a motion that arrives, try swing=True, or relax the limits",
         )
     return _bound(mechanism, replace(best, iterations=iterations), began)
 

@@ -34,8 +34,9 @@ ITERATIONS = 200
 #: Iterations for trying whether a motion can be run twice as fast: mostly 10 to 45.
 HASTE = 60
 
-#: How much faster a motion that may end early is run, until that costs so much more.
-QUICKER, DEARER = 1.25, 1.05
+#: How much faster a motion that may end early is run, until that costs so much more: of what swings
+#: about its target the cost has a valley in each swing.
+QUICKER, DEARER, SWINGING = 1.25, 1.05, 2.0
 
 #: Mean of (u_i/u_max,i)² below which a motion could clearly be run faster.
 IDLE = 0.05
@@ -135,6 +136,7 @@ class Programme:
         #: The cost that IPOPT's tolerances, which are absolute, take for one.
         self.unit = 1.0
         self.effort = dynamics(ca, mechanism, sp.sympify(effort) / mechanism.m, margins)
+        self._held: list[float] = []  # costs of motions until the horizon, each released once
 
     def _interval(self, dynamics: Any) -> Any:
         """One interval: its defects (4n), its cost, and the margins at its midpoint and end."""
@@ -275,7 +277,11 @@ class Programme:
             even = rests(self.mechanism)
             mesh = first_mesh(count, 1.0 if even else self.scale / self.longest)
             held = self.solve(mesh, guess, self.cost, fixed=self.longest)
-            return held if held.status is None else self._released(held, count)
+            known = np.isclose(held.cost, self._held, rtol=1e-7, atol=0.0).any()
+            if held.status is not None and not known:
+                self._held.append(held.cost)
+                held = self._released(held, count)
+            return held
         spent = 0
         mesh = np.linspace(0.0, 1.0, count + 1)
         durations = {min(guess.time, 2.0 * self.scale), guess.time, 3.0 * guess.time}
@@ -301,26 +307,39 @@ class Programme:
         """Let the final time of a motion go from where it first arrives, if that is early.
 
         The cost hardly depends on a final time that is much too long, so ever shorter ones are
-        tried first, until the cost has risen; gains within the meshes' own error are none.
+        tried first, until the cost has risen; gains within the meshes' own error are none.  Of
+        what swings about its target each swing is a valley, and the best one of all is looked for.
         """
-        arrives = held.until(self.radius)
-        if arrives.time >= held.time:
+        arrives, swings = held.until(self.radius), rests(self.mechanism)
+        if arrives.time >= held.time and not swings:
             return held
         mesh, spent = np.linspace(0.0, 1.0, count + 1), held.iterations
         best, next_guess = held, arrives.as_guess()
+        dearer = SWINGING if swings else DEARER
         while next_guess.time > 1e-3 * arrives.time:
-            tried = self.solve(mesh, next_guess, self.cost, fixed=next_guess.time)
-            spent += tried.iterations
-            if tried.status is None or tried.cost > DEARER * best.cost:
+            time = next_guess.time
+            for fixed in (None, time) if swings else (time,):
+                tried = self.solve(mesh, next_guess, self.cost, fixed=fixed)
+                spent += tried.iterations
+                if tried.status is not None:
+                    break
+            if tried.status is None or tried.cost > dearer * best.cost:
                 break
             best = min(best, tried, key=lambda s: s.cost)
-            next_guess = tried.as_guess(pace=QUICKER)
+            next_guess = tried.as_guess(pace=QUICKER * tried.time / time)
         if best.cost >= (1.0 - SETTLED) * held.cost:
             return replace(held, iterations=spent)
         freed = self.solve(mesh, best.as_guess(), self.cost, fixed=None)
         if freed.status is not None and freed.cost < best.cost:
             best = freed
         return replace(best, iterations=spent + freed.iterations)
+
+    def near(self, guess: Guess, count: int) -> Solution | None:
+        """Solve at a free final time near that of a motion that arrives; None for another one."""
+        end = guess.x(np.array([0.0, guess.time]))[-1]
+        if guess.time > self.longest or np.linalg.norm(end) > self.radius * (1 + 1e-6):
+            return None
+        return self.solve(np.linspace(0.0, 1.0, count + 1), guess, self.cost, fixed=None)
 
     def refine(self, solution: Solution) -> Solution:
         """Adapt and refine the mesh until cost and defects have settled."""

@@ -160,7 +160,8 @@ def _number(text: str, what: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise InvalidInputError(what, value=repr(text), limit="a finite number")
+        remedy = "Write the number alone: quantities that are set are in SI units"
+        raise InvalidInputError(what, value=repr(text), limit="a finite number", remedy=remedy)
     return value
 
 

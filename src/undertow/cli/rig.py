@@ -97,8 +97,8 @@ def run(
         Length of the run, s.
     rig : RIG
         ideal: the model. realistic: a bench with friction, delay and encoders. mujoco: the physics
-        engine. FILE.xml: your own MJCF. FILE.py:NAME: your own driver, a class or a function that
-        returns one.
+        engine, on the mechanism's own MJCF file if it has one. FILE.xml: your own MJCF.
+        FILE.py:NAME: your own driver, a class or a function that returns one.
     swing_up
         Begin hanging at rest: swing up, catch, balance.
     known

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from numbers import Real
@@ -312,6 +312,15 @@ class Input(_Named):
         if not number_of(whose, self.limit, remedy=remedy) > 0:
             value = f"{self.limit:g} {self.unit}"
             raise InvalidInputError(whose, value=value, limit="positive", remedy=remedy)
+
+
+def in_degrees(coordinates: Sequence[Coordinate], m: int, x: FloatArray) -> str:
+    """What to do where a free one of x, (2n,), is more than a turn off zero; empty if none is."""
+    for c, angle in zip(coordinates[m:], x[m:].tolist(), strict=False):
+        if c.unit == "rad" and abs(angle) > 2 * math.pi:
+            turns = f"{c.name} = {angle:.4g} rad is {math.degrees(angle):.4g}°"
+            return f"{turns}: if degrees are meant, give undertow.deg({angle:.4g})"
+    return ""
 
 
 def numbers(matrix: Any) -> FloatArray:

@@ -11,7 +11,7 @@ import numpy as np
 from undertow.base import InfeasibleError, InvalidInputError, SingularSurfaceError, check_fields
 from undertow.closed_loop import ClosedLoop, Event
 from undertow.law import Margin, Plan, Surface, surface_margins
-from undertow.models import FloatArray, Mechanism
+from undertow.models import FloatArray, Mechanism, in_degrees
 from undertow.models.importers import holding_input, least_peak
 
 Status = Literal["converged", "budget spent", "infeasible", "failed"]
@@ -120,21 +120,11 @@ class Proposal:
                 value=self.message,
                 limit="every margin ≥ 0 and the terminal set reached within "
                 f"{loop.objective.horizon:g} s",
-                remedy=_in_degrees(loop, x)
+                remedy=in_degrees(loop.mechanism.coordinates, loop.mechanism.m, x)
                 or _too_weak(loop)
                 or _turned(loop.mechanism, x) + _too_far(loop, x) + self.remedy,
             )
         return self
-
-
-def _in_degrees(loop: ClosedLoop, x: FloatArray) -> str:
-    """What to do where a free joint begins more than a turn off; empty where none does."""
-    m, coordinates = loop.mechanism.m, loop.mechanism.coordinates
-    for c, angle in zip(coordinates[m:], x[m:].tolist(), strict=False):
-        if c.unit == "rad" and abs(angle) > 2 * math.pi:
-            turns = f"{c.name} = {angle:.4g} rad is {math.degrees(angle):.4g}°"
-            return f"{turns}: if degrees are meant, give undertow.deg({angle:.4g})"
-    return ""
 
 
 def _turned(mechanism: Mechanism, x: FloatArray) -> str:
@@ -158,7 +148,7 @@ def _too_weak(loop: ClosedLoop) -> str:
     """What to do where the inputs cannot hold the mechanism at the target; empty where they can."""
     held = np.abs(holding_input(loop.mechanism))
     weak = [
-        f"{given.name} of {u:.3g} {given.unit}, and its limit is {limit:.3g}"
+        f"{given.name} of {f'{u:.3g} {given.unit}'.rstrip()}, and its limit is {limit:.3g}"
         for given, u, limit in zip(loop.mechanism.inputs, held, loop.input_limits, strict=True)
         if u >= limit
     ]

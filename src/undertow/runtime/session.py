@@ -13,7 +13,7 @@ from undertow.base import InvalidInputError, checked, positive
 from undertow.cascade import Cascade, CascadeState
 from undertow.estimators import MakeEstimator
 from undertow.law import Reference, SetPoints, Target
-from undertow.mechanisms.named import origin
+from undertow.mechanisms.named import DataName, origin
 from undertow.models import StateLike
 from undertow.models.importers.formats import FORMATS, MJCF
 from undertow.models.importers.python_file import in_a_file
@@ -42,7 +42,8 @@ from undertow.runtime.workers import InlineWorker, Worker, background_worker
 def rig_named(word: str, recipe: Recipe, *, supervised: bool) -> Rig | None:
     """Return the rig that is asked for, or nothing for one that the recipe itself makes.
 
-    The word is ``ideal``, ``realistic``, ``mujoco``, ``FILE.xml`` or ``FILE.py:NAME``;
+    The word is ``ideal``, ``realistic``, ``mujoco``, ``FILE.xml`` or ``FILE.py:NAME``; in MuJoCo a
+    mechanism of an MJCF file moves as that file, one of the library as its own scene.
     ``supervised``: a process of its own holds the rig.
 
     Raises
@@ -70,8 +71,10 @@ def rig_named(word: str, recipe: Recipe, *, supervised: bool) -> Rig | None:
             return plant
         plant.close()  # it can be made; now the process that will hold it makes it
         return held(lambda: rig_from_file(word, recipe.belief))
-    if word == "mujoco" or FORMATS.get(Path(word).suffix.lower()) is MJCF:
-        scene = None if word == "mujoco" else Path(word)
+    if word == "mujoco" or _is_mjcf(Path(word)):
+        data = DataName.of(recipe.mechanism) if isinstance(recipe.mechanism, str) else None
+        own = data.file if data and _is_mjcf(data.file) else None
+        scene = own if word == "mujoco" else Path(word)
         at = origin(recipe.mechanism) if scene and isinstance(recipe.mechanism, str) else {}
 
         def engine() -> Rig:
@@ -84,6 +87,10 @@ def rig_named(word: str, recipe: Recipe, *, supervised: bool) -> Rig | None:
         limit="ideal, realistic, mujoco, FILE.xml, FILE.mjcf or FILE.py:NAME",
         remedy="A driver of your own: see examples/serial_rig.py",
     )
+
+
+def _is_mjcf(path: Path) -> bool:
+    return FORMATS.get(path.suffix.lower()) is MJCF
 
 
 @contextmanager

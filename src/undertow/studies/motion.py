@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -124,8 +125,9 @@ def motion_report(
         (
             "largest input",
             ", ".join(
-                f"|{channel.name}| = {abs(motion.u[:, i]).max():.3g} of {channel.limit:g} "
-                f"{channel.unit}"
+                f"|{channel.name}| = {abs(motion.u[:, i]).max():.3g}"
+                + f" of {channel.limit:g}" * math.isfinite(channel.limit)
+                + f" {channel.unit}".rstrip()
                 for i, channel in enumerate(mechanism.inputs)
             ),
         ),

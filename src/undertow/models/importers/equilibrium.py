@@ -13,6 +13,7 @@ import sympy as sp
 from undertow.base import InvalidInputError, ModelError, checked, floats, one_of
 from undertow.models.importers.equations import check_balanced, shifted
 from undertow.models.importers.tree import LARGEST
+from undertow.models.importers.xml_files import without_rounding
 from undertow.models.linearisation import AT_REST, controllability, force_scale, linearise
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.models.quantities import number_of
@@ -66,7 +67,7 @@ def find_equilibrium(mechanism: Mechanism, /, **guess: float) -> dict[str, float
     >>> round(find_equilibrium(rig, phi=3.0)["phi"], 6)
     3.141593
     """
-    q, relative = _solved(mechanism, _positions(mechanism, guess))
+    q, relative = _solved(mechanism, _positions(mechanism, guess), mechanism.m)
     if not relative <= AT_REST:
         scale = force_scale(mechanism)
         raise ModelError(
@@ -98,7 +99,8 @@ def at_equilibrium(mechanism: Mechanism, target: str | Mapping[str, float] = "")
 
     Searched are the equilibria near poses with every hinge at 0 or 180° (the first one at ±90°
     too), that lie inside the travel of all joints and that the inputs can hold within their
-    limits.
+    limits.  Actuated joints stay there, or in the middle of their travel; where the inputs cannot
+    hold that, they go to where the inputs are zero, as a servo with a load does.
 
     Parameters
     ----------
@@ -181,9 +183,11 @@ def _nearest_first(mechanism: Mechanism) -> Iterator[FloatArray]:
 
 def _none_found(mechanism: Mechanism) -> ModelError:
     """The refusal of a mechanism without an equilibrium."""
+    poses = ((*_obstacle(mechanism, q), _position(mechanism, q)) for q in _poses(mechanism))
+    _, obstacle, pose = min(poses, default=(0.0, "that was found", ""))
     return ModelError(
         f"equilibria of '{mechanism.name}'",
-        value="none that was found",
+        value=f"none: {pose} {obstacle}" if pose else f"none {obstacle}",
         limit="a pose inside the travel of the joints, which the inputs hold within limits",
         remedy=_adrift(mechanism) or "Say where one is: JOINT=ANGLE for every joint",
     )
@@ -228,38 +232,10 @@ def _rests(mechanism: Mechanism) -> bool:
 def _equilibria(mechanism: Mechanism) -> Iterator[_Equilibrium]:
     """Find equilibria inside the travel that the inputs hold, the nearest to zero first."""
     n, m = mechanism.n, mechanism.m
-    hinges = [i for i, c in enumerate(mechanism.coordinates) if c.unit == "rad"]
-    low = np.array([c.low for c in mechanism.coordinates])
-    high = np.array([c.high for c in mechanism.coordinates])
-    sample = np.random.default_rng(0).uniform(-2, 2, (64, n))
-    forces = mechanism.f(np.hstack([sample, np.zeros_like(sample)]))[:, m:]
-    falls = np.ptp(forces, axis=0) < 1e-9 * np.abs(forces).max(axis=0)
-    if falls.any():  # a force that is the same everywhere, and not zero
-        return
-    tries: list[tuple[float, ...]] = [(0.0, math.pi)] * min(len(hinges), _TRIED) + [(0.0,)] * (
-        len(hinges) - _TRIED
-    )
-    if tries:
-        tries[0] = (0.0, math.pi, math.pi / 2, -math.pi / 2)
     found: list[FloatArray] = []
-    for angles in itertools.product(*tries):
-        guess = np.zeros(n)
-        guess[hinges] = angles
-        guess = np.where(guess > high, guess - 2 * math.pi, guess)
-        q, left = _solved(mechanism, guess)
-        turned = np.where(
-            [c.unit == "rad" and math.isinf(c.high) for c in mechanism.coordinates],
-            np.remainder(q + math.pi - 1e-9, 2 * math.pi) - math.pi + 1e-9,
-            q,
-        )
-        turned[np.abs(turned) < 1e-12] = 0.0
-        if left <= AT_REST and _residual(mechanism, turned) <= AT_REST:
-            q = turned
-        inside = bool(np.all((q > low) & (q < high)))
-        if not (left <= AT_REST and inside):
-            continue
-        held = np.abs(holding_input(mechanism, q)) <= mechanism.input_limits
-        if held.all() and not any(np.abs(q - other).max() < 1e-6 for other in found):
+    for q in _poses(mechanism):
+        known = any(np.abs(q - other).max() < 1e-6 for other in found)
+        if not (known or _obstacle(mechanism, q)[0]):
             found.append(q)
     scale = force_scale(mechanism)
     for q in sorted(found, key=lambda q: float(np.linalg.norm(q))):
@@ -272,6 +248,74 @@ def _equilibria(mechanism: Mechanism) -> Iterator[_Equilibrium]:
         yield _Equilibrium(q, energy, stable)
 
 
+def _obstacle(mechanism: Mechanism, q: FloatArray) -> tuple[float, str]:
+    """What forbids to rest at q, as a size and in words; the size is 0 where nothing does."""
+    outside = [
+        c.name
+        for c, v in zip(mechanism.coordinates, q.tolist(), strict=True)
+        if not c.low < v < c.high
+    ]
+    if outside:
+        return math.inf, f"is outside the travel of {', '.join(outside)}"
+    held = holding_input(mechanism, q)
+    shares = np.abs(held) / mechanism.input_limits
+    i = int(shares.argmax())
+    channel = mechanism.inputs[i]
+    if shares[i] <= 1:
+        return 0.0, ""
+    return shares[i], f"takes {channel.name} = {held[i]:.3g}, limited to {channel.limit:g}"
+
+
+def _poses(mechanism: Mechanism) -> Iterator[FloatArray]:
+    """Find poses of rest, beyond travel and limits too.
+
+    The actuated coordinates stay where the search begins; where the inputs could not hold that, the
+    pose in which they are zero comes next: that of a servo and of what hangs on a spring.
+    """
+    n, m = mechanism.n, mechanism.m
+    hinges = [i for i, c in enumerate(mechanism.coordinates) if c.unit == "rad"]
+    low = np.array([c.low for c in mechanism.coordinates])
+    high = np.array([c.high for c in mechanism.coordinates])
+    middle = np.clip(np.zeros(n), low, high)
+    bounded = np.isfinite(high - low)
+    middle[bounded] = (low[bounded] + high[bounded]) / 2
+    sample = np.random.default_rng(0).uniform(-2, 2, (64, n))
+    forces = mechanism.f(np.hstack([sample, np.zeros_like(sample)]))[:, m:]
+    falls = np.ptp(forces, axis=0) < 1e-9 * np.abs(forces).max(axis=0)
+    if falls.any():  # a force that is the same everywhere, and not zero
+        return
+    tries: list[tuple[float, ...]] = [(0.0, math.pi)] * min(len(hinges), _TRIED) + [(0.0,)] * (
+        len(hinges) - _TRIED
+    )
+    if tries:
+        tries[0] = (0.0, math.pi, math.pi / 2, -math.pi / 2)
+    for angles in itertools.product(*tries):
+        guess = np.zeros(n)
+        guess[hinges] = angles
+        guess = np.where(guess > high, guess - 2 * math.pi, guess)
+        guess = np.where((guess > low) & (guess < high), guess, middle)
+        for kept in (m, 0):
+            q, left = _solved(mechanism, guess, kept)
+            if left > AT_REST:
+                break
+            q = _unturned(mechanism, q)
+            yield q
+            if _obstacle(mechanism, q)[0] in (0.0, math.inf):
+                break
+            guess = q
+
+
+def _unturned(mechanism: Mechanism, q: FloatArray) -> FloatArray:
+    """Return a pose of rest with hinges that turn round and round within half a turn."""
+    turned = np.where(
+        [c.unit == "rad" and math.isinf(c.high) for c in mechanism.coordinates],
+        np.remainder(q + math.pi - 1e-9, 2 * math.pi) - math.pi + 1e-9,
+        q,
+    )
+    turned[np.abs(turned) < 1e-12] = 0.0
+    return turned if _residual(mechanism, turned) <= AT_REST else q
+
+
 def _residual(mechanism: Mechanism, q: FloatArray) -> float:
     """|f_u| at rest at q, relative."""
     force = mechanism.f(np.append(q, np.zeros(mechanism.n)))[mechanism.m :]
@@ -282,7 +326,7 @@ def _placed(mechanism: Mechanism, equilibrium: Mapping[str, float], words: str) 
     """Return the mechanism about an equilibrium, with a usual start, and words about it."""
     q = _positions(mechanism, equilibrium)
     moved = move_target(mechanism, **equilibrium) if np.any(q) else mechanism
-    held = holding_input(moved)
+    held = without_rounding(holding_input(moved), force_scale(moved))
     force = ", ".join(f"{i.name} = {u:.3g}" for i, u in zip(moved.inputs, held, strict=True) if u)
     words = words if np.any(q) else "zero" + f", {words}" * (words in WORDS)
     text = f"target {words}: {_position(mechanism, q)} of the file"
@@ -393,26 +437,28 @@ def _adrift(mechanism: Mechanism) -> str:
     )
 
 
-def _solved(mechanism: Mechanism, q: FloatArray) -> tuple[FloatArray, float]:
-    """Solve f_u(q, 0) = 0 for the free coordinates, from q on; the actuated ones are kept.
+def _solved(mechanism: Mechanism, q: FloatArray, kept: int) -> tuple[FloatArray, float]:
+    """Solve f(q, 0) = 0 for the coordinates behind the first ``kept``, from q on.
+
+    As many equations as coordinates are kept are left out: those of the inputs, where the m
+    actuated ones are.
 
     Returns
     -------
     numpy.ndarray, float
-        Positions, (n,), and the |f_u| that is left, relative to :func:`force_scale`.
+        Positions, (n,), and the force that is left, relative to :func:`force_scale`.
     """
     from scipy.optimize import root  # slow to import
 
-    n, m, scale = mechanism.n, mechanism.m, force_scale(mechanism)
+    n, scale = mechanism.n, force_scale(mechanism)
 
-    def force(q_u: FloatArray) -> FloatArray:
-        x = np.zeros(2 * n)
-        x[:m], x[m:n] = q[:m], q_u
-        return np.asarray(mechanism.f(x)[m:] / scale)
+    def force(moved: FloatArray) -> FloatArray:
+        x = np.concatenate([q[:kept], moved, np.zeros(n)])
+        return np.asarray(mechanism.f(x)[kept:] / scale)
 
     try:
-        found = _polished(force, root(force, q[m:], tol=1e-14).x)
-        return np.concatenate([q[:m], found]), float(np.abs(force(found)).max())
+        found = _polished(force, root(force, q[kept:], tol=1e-14).x)
+        return np.concatenate([q[:kept], found]), float(np.abs(force(found)).max())
     except InvalidInputError:  # the search left what can be computed
         return q, math.inf
 

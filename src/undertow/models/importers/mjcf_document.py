@@ -285,6 +285,14 @@ def _meshes(document: Document, folder: Path | None) -> None:
             compiler.attrib.pop(attribute, None)
     size = 0
     for asset in root.iterfind("asset"):
+        for model in asset.findall("model"):
+            raise ModelError(
+                document.what,
+                value=f"<model file='{model.get('file', '')}'>, of which parts are attached",
+                limit="one document, with what it includes",
+                remedy="Let MuJoCo write it as one: spec = mujoco.MjSpec.from_file(FILE); "
+                "spec.compile(); spec.to_xml()",
+            )
         for mesh in asset.findall("mesh"):
             named = mesh.get("file", "")
             name = mesh.get("name") or PurePosixPath(named).stem

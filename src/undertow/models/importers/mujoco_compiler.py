@@ -307,6 +307,9 @@ class _Compiled:
             if not stateless:
                 raise _refused(f"{what} that has states of its own", "Use <motor>, or name the "
                                "actuated joints: actuated=['...']")  # fmt: skip
+            if np.any(getattr(model, "actuator_delay", np.zeros(k + 1))[k]):
+                raise _refused(f"{what} that acts late", "Take delay= out: delays are the rig's, "
+                               "undertow.plants.Timing(input_delay=...)")  # fmt: skip
             linear = int(model.actuator_gaintype[k]) == int(mujoco.mjtGain.mjGAIN_FIXED)
             biases = {int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)}
             if not linear or int(model.actuator_biastype[k]) not in biases:
@@ -424,6 +427,9 @@ def urdf_compiled(mujoco: Any, robot: ET.Element, gravity: Vector) -> Any | None
     for element in list(bare):
         if element.tag not in ("link", "joint"):
             bare.remove(element)
+    for element in bare.iter("inertia"):
+        for product in ("ixy", "ixz", "iyz"):
+            element.attrib.setdefault(product, "0")
     for element in bare.iter():  # as they were read, commas and all
         for attribute, count in _LENGTHS.items():
             if attribute in element.attrib:
@@ -451,10 +457,7 @@ def compared(
     mujoco = engine()
     assert mujoco is not None  # it compiled the model
     worst = compare(mujoco, model, mechanism, tree, q_target, driven=driven)
-    version = f"MuJoCo {mujoco.__version__}"
-    if math.isnan(worst):
-        return f"{version}, not compared with it: joints have no names"
-    return f"{version}, {_ALIKE} {worst:.1g}"
+    return f"MuJoCo {mujoco.__version__}, {_ALIKE} {worst:.1g}"
 
 
 def agreement(mechanism: Mechanism) -> str:
@@ -494,11 +497,10 @@ def compare(
         Where the difference is beyond :data:`AGREEMENT`.
     """
     kinds = mujoco.mjtObj
-    joints = [mujoco.mj_id2name(model, kinds.mjOBJ_JOINT, j) for j in range(model.njnt)]
     own = [joint.name for joint in tree.moving]
-    order = [own.index(name) if name in own else j for j, name in enumerate(joints)]
-    if sorted(order) != list(range(len(own))):
-        return math.nan  # joints without names that come in another order
+    read = [joint.name for joint in tree.joints if joint.kind != "fixed"]  # as MuJoCo has them
+    named = (mujoco.mj_id2name(model, kinds.mjOBJ_JOINT, j) for j in range(model.njnt))
+    order = [own.index(name or read[j]) for j, name in enumerate(named)]
     n, m, bits = mechanism.n, mechanism.m, mujoco.mjtDisableBit
     model = copy.copy(model)
     off = ["CONTACT", "LIMIT", "FRICTIONLOSS", "CLAMPCTRL", *["ACTUATION"] * (not driven)]

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 import sympy as sp
 
-from undertow.base import ModelError, checked, one_of
+from undertow.base import InvalidInputError, ModelError, checked, one_of
 from undertow.models.importers.coordinates import number, tidy
 from undertow.models.importers.equations import from_matrices, lagrange_force, unit_inputs
 from undertow.models.importers.reading import names_of
@@ -232,6 +232,13 @@ def _inputs(
             push, unit = pushes[chosen[name].kind]
             made.append(Input(f"{name}_{push}", unit, effort.get(given, chosen[name].effort)))
         return made, B
+    if effort:
+        raise InvalidInputError(
+            f"effort of '{tree.name}'",
+            value=", ".join(map(str, effort)),
+            limit="joints that are named as actuated; the file's motors have limits of their own",
+            remedy="Name the joints, actuated=['...'], or take mechanism.with_input_limit(...)",
+        )
     if not tree.actuators:
         raise ModelError(
             f"'{tree.name}' names no actuator",

@@ -11,13 +11,14 @@ from typing import Literal
 
 import numpy as np
 
-from undertow.base import ModelError, checked, one_of
+from undertow.base import InvalidInputError, ModelError, checked, one_of
 from undertow.models.importers.equilibrium import at_equilibrium
 from undertow.models.importers.mujoco_compiler import compared, engine, urdf_compiled
 from undertow.models.importers.reading import described, names_of
 from undertow.models.importers.rigid_body import check_held, mechanism_from_tree
 from undertow.models.importers.tree import FREE_BASE, WORLD, Joint, Link, Tree, Vector
 from undertow.models.importers.xml_files import (
+    EXPAND,
     computable,
     is_text,
     numbers_of,
@@ -26,6 +27,9 @@ from undertow.models.importers.xml_files import (
     without_rounding,
 )
 from undertow.models.mechanism import FloatArray, Mechanism
+
+#: Where the elements of ROS' macros come from.
+_XACRO = ("{http://www.ros.org/wiki/xacro}", "{http://ros.org/wiki/xacro}")
 
 _KINDS: dict[str, Literal["hinge", "slide", "fixed"]] = {
     "revolute": "hinge",
@@ -60,8 +64,8 @@ def from_urdf(
         Path of the file, or the text itself.
     actuated
         Names of the actuated joints, in the order of the inputs.  By default those of the file's
-        ``<transmission>`` elements, or, without any, those with an effort limit where others have
-        none.
+        ``<transmission>`` elements and those with a command interface in its ``<ros2_control>``
+        elements, or, without any, those with an effort limit where others have none.
     frozen
         Names of joints that do not belong to the mechanism: they become fixed as they are drawn.
     equilibrium
@@ -82,7 +86,8 @@ def from_urdf(
     Raises
     ------
     InvalidInputError
-        For malformed XML, invalid numbers, unknown or repeated actuated joints.
+        For malformed XML, macros that xacro has yet to expand, invalid numbers, unknown or repeated
+        actuated joints.
     ModelError
         For loops, massless moving links, inertias that no body has, floating or planar joints,
         mimic joints, repeated names, and more joints than equations can be derived for.
@@ -150,6 +155,7 @@ def read_urdf(
 @np.errstate(all="ignore")
 def _read(robot: ET.Element, gravity: Vector) -> tuple[Tree, tuple[str, ...]]:
     name = robot.get("name", "robot")
+    _check_expanded(robot)
     links = [_link(element) for element in robot.findall("link")]
     joints = [_joint(element) for element in robot.findall("joint")]
     if not links:
@@ -179,8 +185,22 @@ def _read(robot: ET.Element, gravity: Vector) -> tuple[Tree, tuple[str, ...]]:
     kept = tuple(link for link in links if link.name != WORLD)
     tree = Tree(name, kept, tuple(joints), gravity)
     still = {joint.name for joint in joints if joint.kind == "fixed"}
-    transmitted = [joint.get("name", "") for joint in robot.iterfind("transmission/joint")]
+    driven = list(robot.iterfind("transmission/joint"))
+    driven += robot.iterfind("ros2_control/joint[command_interface]")
+    transmitted = dict.fromkeys(joint.get("name", "") for joint in driven)
     return tree, tuple(name for name in transmitted if name not in still)
+
+
+def _check_expanded(robot: ET.Element) -> None:
+    """Refuse what xacro has not put its own elements into yet: bodies would be missing."""
+    left = next((e.tag for e in robot.iter() if e.tag.startswith(_XACRO)), None)
+    if left is not None:
+        raise InvalidInputError(
+            f"URDF '{robot.get('name', 'robot')}'",
+            value=f"<xacro:{left.partition('}')[2]}>",
+            limit="a URDF without macros",
+            remedy=EXPAND,
+        )
 
 
 def _pose(element: ET.Element, of: str) -> tuple[FloatArray, Vector]:
@@ -239,12 +259,13 @@ def _joint(element: ET.Element) -> Joint:
     kind = element.get("type", "")
     free = FREE_BASE if kind in ("floating", "planar") else "Model it by hinges and slides"
     one_of(f"type of joint '{name}'", kind, _KINDS, free, ModelError)
-    if element.find("mimic") is not None:
+    if kind != "fixed" and element.find("mimic") is not None:
         raise ModelError(
             f"joint '{name}'",
             value="a mimic joint, which is a constraint",
             limit="independent joints",
-            remedy="Eliminate it and give M, f and B, or make the joint fixed",
+            remedy="Eliminate it and give M, f and B, or make the joint fixed: "
+            f"frozen=['{name}'], FILE:-{name}",
         )
     R, position = _pose(element, name)
     parent = _child(element, "parent", name).get("link", "")

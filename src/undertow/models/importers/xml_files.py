@@ -27,6 +27,10 @@ _DEFAULTED = re.compile(r"\$\(optenv\s+\S+\s+([^()]*)\)")
 _STOP = re.compile(r"(\d\.\d+)\.(?=\s|$)")
 
 
+#: What to do about a file that xacro, the macros of ROS, is yet to make.
+EXPAND = "Let xacro expand it first: xacro FILE.xacro > FILE.urdf"
+
+
 def is_text(source: str | Path) -> bool:
     """Whether a source is XML itself, and no path."""
     return isinstance(source, str) and source.lstrip().startswith("<")
@@ -179,6 +183,8 @@ def numbers_of(
             label, value="missing", limit="given", remedy="The format has no default for it"
         )
     wanted, shown = "Write numbers, 0.5 or 1e-3, with spaces between", repr(text[:60])
+    if "${" in text or "$(" in text:
+        wanted = EXPAND
     try:
         if not text.isascii() or "_" in text:  # of which Python, but no XML reader, makes numbers
             raise ValueError(text)
@@ -223,8 +229,8 @@ def rotation_from_quaternion(quaternion: list[float]) -> FloatArray:
     )
 
 
-def without_rounding(values: FloatArray) -> FloatArray:
-    """Drop what rotations leave of entries that should be zero."""
+def without_rounding(values: FloatArray, scale: float = 0.0) -> FloatArray:
+    """Drop what rotations leave of entries that should be zero, beside the largest or ``scale``."""
     clean = np.array(values, dtype=np.float64)
-    clean[np.abs(clean) < 1e-14 * max(float(np.abs(clean).max()), 1e-300)] = 0.0
+    clean[np.abs(clean) < 1e-14 * max(float(np.abs(clean).max()), scale, 1e-300)] = 0.0
     return clean

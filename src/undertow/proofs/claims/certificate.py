@@ -218,4 +218,10 @@ def read_certificate(path: Path) -> Certificate:
         raise CertificateError(
             f"certificate '{path}'", value=f"{size} bytes", limit=f"at most {LARGEST}"
         )
-    return Certificate.from_bytes(read_file(path, "certificate", most=LARGEST, remedy=remedy))
+    content = read_file(path, "certificate", most=LARGEST, remedy=remedy)
+    try:
+        return Certificate.from_bytes(content)
+    except CertificateError as error:
+        raise CertificateError(
+            f"certificate '{path}'", value=error.value, limit=error.limit, remedy=error.remedy
+        ) from error

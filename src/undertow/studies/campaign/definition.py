@@ -63,7 +63,10 @@ class Definition:
             said = tomllib.loads(content.decode())
         except ValueError as error:  # of the text, or of its encoding
             raise ArtefactError(
-                f"definition of a campaign '{path}'", value=str(error), limit="TOML"
+                f"definition of a campaign '{path}'",
+                value=str(error),
+                limit="TOML",
+                remedy="docs/campaigns.md shows one",
             ) from error
         several = said.get("mechanisms")
         first = several[0] if isinstance(several, list) and several else None

@@ -12,6 +12,7 @@ import numpy as np
 
 from undertow.base import (
     InfeasibleError,
+    InvalidInputError,
     MissingExtraError,
     Progress,
     no_progress,
@@ -105,15 +106,32 @@ def recorded_run(
     name: str, mechanism: Mechanism, x0: FloatArray, objective: str, period: float, seed: int = 0,
     progress: Progress = no_progress,
 ) -> Message:  # fmt: skip
-    """Simulate a mechanism that was asked for by name to its target, and return the recording."""
+    """Simulate a mechanism that was asked for by name to its target, and return the recording.
+
+    Raises
+    ------
+    InvalidInputError
+        For a start at the target: there is no motion.
+    """
     limits = tuple(mechanism.input_limits.tolist())
     cascade = cascade_for(mechanism, Task(objective, limits, period), seed)
+    radius, away = cascade.objective.terminal_radius, float(np.linalg.norm(x0))
+    if away <= radius:
+        raise InvalidInputError(
+            f"start of '{mechanism.name}'",
+            value=f"‖x‖ = {away:.3g}",
+            limit=f"more than {radius:g}, where {objective} has arrived",
+            remedy="Start further off, --start STATE=VALUE, or take another --objective",
+        )
     progress("simulating", 0.0)
     run = cascade.simulate(x0, progress=lambda t, end: progress("simulating", t / end))
     least = None
     with suppress(MissingExtraError, InfeasibleError):  # then there is none to compare with
         progress("the bound", 0.9)
-        least = bound(cascade.mechanism, cascade.objective, x0, intervals=INTERVALS)
+        least = bound(
+            cascade.mechanism, cascade.objective, x0, intervals=INTERVALS,
+            guess=run.trajectory if run.reached else None,
+        )  # fmt: skip
     return of_run(run, cascade, sketch_named(name, mechanism), least)
 
 
