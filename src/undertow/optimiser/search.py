@@ -140,8 +140,11 @@ def _own_search(task: Optimisation) -> Iterator[bool]:
     scores = task.cost(z)
     if task.optimiser.counts_time:
         done = _along_ridge(task, min(POLISH, task.left))
-        if not task.best_cost < INADMISSIBLE and task.loop.ensemble is not None:
-            _near_one_plant(task)
+        if not task.best_cost < INADMISSIBLE:
+            if task.loop.ensemble is None:
+                _descend_from_draws(task, ALONE, 3 * ALONE)
+            else:
+                _near_one_plant(task)
             done = _along_ridge(task, min(POLISH, task.left))
         yield done
         again, done = task.optimiser.freedom.schedule > 0, False
@@ -202,6 +205,14 @@ def _near_one_plant(task: Optimisation) -> None:
         for spread in (0.1, 0.3, 0.03):
             if not task.best_cost < INADMISSIBLE:
                 _descend(task, task.space.encode(one.best), spread, min(ALONE, task.left), 1e-3)
+
+
+def _descend_from_draws(task: Optimisation, draws: int, share: int) -> None:
+    """Descend from the best three of many draws, until a plan is admissible."""
+    z = task.firsts[0] + task.space.steps(task.rng, np.ones(max(1, min(draws, task.left))))
+    for start in z[np.argsort(task.cost(z), kind="stable")[:3]]:
+        if not task.best_cost < INADMISSIBLE:
+            _descend(task, start, 0.3, share, 3e-3)
 
 
 def single_budget(size: int) -> int:
