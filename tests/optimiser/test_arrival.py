@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -171,6 +172,19 @@ def test_a_loop_without_a_linear_model_arrives_about_as_early(other: dict[str, A
         for how in ({}, other)
     )
     assert found.cost <= 1.02 * usual.cost
+
+
+def test_where_no_design_arrives_descents_from_draws_find_what_does() -> None:
+    """A wheel that leans nearly as far as its voltage bears: these seeds found nothing without."""
+    rig = ut.mechanisms.reaction_wheel_pendulum()
+    cascade = ut.Cascade(rig, ut.MinimumTime(horizon=6.0), belief="exact")
+    optimiser, x0 = cascade.optimiser, rig.state(phi=ut.deg(2.6))
+    designs = [ut.Plan.of(design) for design in optimiser.designs]
+    assert not cascade.loop.batch(x0, designs).reached.any()
+    for seed in (0, 2, 3):
+        found = replace(optimiser, seed=seed).propose(x0, budget=ut.Budget(8000))
+        assert found.plan is not None
+        assert cascade.loop.batch(x0, found.plan, precise=True).reached[0]
 
 
 @pytest.mark.slow
