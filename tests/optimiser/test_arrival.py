@@ -13,6 +13,7 @@ from support import rest_slow
 from undertow.optimiser.arrival import ArrivalSearch, FloatArray, _steps, closer
 
 RADIUS = 1e-3
+SLOW = pytest.mark.slow
 
 
 class Push:
@@ -157,11 +158,16 @@ def test_the_better_basin_is_found() -> None:
 @pytest.mark.parametrize(
     "other",
     [
-        {"step": 0.001, "zoh_steps": 1},
-        {"reaching": ut.ReachingLaw(switching="sign")},
-        {"plant": ut.mechanisms.rotary_pendulum(d_e=0.025).with_parameters(m=0.13)},
+        pytest.param({"step": 0.001, "zoh_steps": 1}, id="held for 1 ms"),
+        pytest.param(
+            {"reaching": ut.ReachingLaw(switching="sign")}, id="discontinuous", marks=SLOW
+        ),
+        pytest.param(
+            {"plant": ut.mechanisms.rotary_pendulum(d_e=0.025).with_parameters(m=0.13)},
+            id="on another plant",
+            marks=SLOW,
+        ),
     ],
-    ids=["held for 1 ms", "discontinuous", "on another plant"],
 )
 def test_a_loop_without_a_linear_model_arrives_about_as_early(other: dict[str, Any]) -> None:
     """An input held, a law that switches, a plant that is not the model: arrivals all the same."""
