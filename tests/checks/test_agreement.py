@@ -40,6 +40,8 @@ from undertow.checks.agreement import (
 )
 from undertow.checks.exact import ExactModel, Number, evaluate
 from undertow.closed_loop import exponential_integrator, kernel
+from undertow.closed_loop.kernel import compile_look, compile_loop
+from undertow.closed_loop.linear_blocks import linear_blocks
 from undertow.law import inner_loop
 from undertow.mechanisms import LIBRARY
 from undertow.proofs.claims.terminal_ellipsoid import ClosedLoopProgram
@@ -65,6 +67,8 @@ def interpreted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Non
     for name in set(sys.modules) - before:
         if str(tmp_path) in str(getattr(sys.modules[name], "__file__", "")):
             del sys.modules[name]  # whoever needs it next wants it compiled
+    for made in (compile_loop, compile_look, linear_blocks):
+        made.cache_clear()
 
 
 def _as_it_is(function: Any = None, **_options: Any) -> Any:
