@@ -306,8 +306,7 @@ class Cascade:
         Where the target is a reference on its way, it is taken to stay where it is at time t, s, by
         default ``state.since``.
         """
-        when = state.since if t is None else t
-        return self.predictions.at(state, when)
+        return self.predictions.at(state, state.since if t is None else t)
 
     @checked
     def believed(self, state: CascadeState) -> Mechanism:

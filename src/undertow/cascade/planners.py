@@ -83,4 +83,4 @@ class Planners:
         self, exact: ClosedLoop, target: ReferenceMotion | None = None, t: float = 0.0
     ) -> Planner:
         """Who is asked for plans on a predicted loop, about a target."""
-        return self.own or self.optimiser_of(exact, target, t)
+        return self.optimiser_of(exact, target, t) if self.own is None else self.own
