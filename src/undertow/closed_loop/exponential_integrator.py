@@ -30,7 +30,7 @@ from collections.abc import Sequence
 
 from undertow.closed_loop.linear_blocks import STEP_SIZES, UNIT
 from undertow.closed_loop.trajectory import Event
-from undertow.closed_loop.work_array import ENTERED, LANES, WorkArray, code, entrance, total
+from undertow.closed_loop.work_array import ENTERED, LANES, WorkArray, code, entrance, entry, total
 
 #: Codes of a lane that waits for its large steps, and of one that cannot be done in this way.
 HANDED_OVER, GIVEN_BACK = -1.0, -2.0
@@ -54,6 +54,20 @@ def _level(r: WorkArray, x: Sequence[str]) -> list[str]:
     ]
 
 
+def fetch(r: WorkArray) -> str:
+    """Fetch the matrices P and A of all lanes."""
+    size = len(r.x)
+    return f"""\
+for i in range({LANES}):
+    for j in range({size}):
+        for k in range({size}):
+            {entry(r.value)} = value[b + i, j, k]
+    for j in range({size // 2}):
+        for k in range({size}):
+            {entry(r.linear)} = linear[b + i, j, k]
+"""
+
+
 def begin(r: WorkArray) -> list[str]:
     """Lanes that handed over begin with the smallest step; their costs include V."""
     size = len(r.x)
@@ -63,16 +77,6 @@ def begin(r: WorkArray) -> list[str]:
         *(f"x_{j} = out[b + i, out.shape[1] - {1 + size - j}]" for j in range(size)),
         *(f"{row} = x_{j}" for j, row in enumerate(r.x)),
         *(f"{row} = x_{j}" for j, row in enumerate(r.stage_x)),
-        *(
-            f"{e} = linear[b + i, {j}, {k}]"
-            for j, row in enumerate(r.linear)
-            for k, e in enumerate(row)
-        ),
-        *(
-            f"{e} = value[b + i, {j}, {k}]"
-            for j, row in enumerate(r.value)
-            for k, e in enumerate(row)
-        ),
         *(f"{row} = out[b + i, {6 + k}]" for k, row in enumerate(r.low)),
         *_level(r, [f"x_{j}" for j in range(size)]),
         f"cost, begins = {r.cost}, {r.code} == {HANDED_OVER}",
@@ -93,31 +97,27 @@ def choose_step(r: WorkArray) -> str:
     Not a loop of vectors: which lanes change, and to which power, is different for each.
     """
     size = len(r.x)
-    n = size // 2
-    parts = [
-        (r.flow, "powers[block, power, ", 0),
-        (r.force, "forced[block, power, 0, ", n),
-        (r.rise, "forced[block, power, 1, ", n),
-    ]
-    lines = [
-        f"{row} = {source}{(j * size + first + k) * LANES} + i]"
-        for matrix, source, first in parts
-        for j, rows in enumerate(matrix)
-        for k, row in enumerate(rows)
-    ]
-    lines += [
-        f"{row} = reach[block, power, {(k * size + j) * LANES} + i]"
-        for k, rows in enumerate(r.reach)
-        for j, row in enumerate(rows)
-    ]
-    body = "\n".join(f"        {line}" for line in lines)
+    half = size // 2
+    bounds = ""
+    if r.boxes:
+        bounds = f"""\
+        for j in range({len(r.boxes)}):
+            for k in range({size}):
+                {entry(r.reach)} = reach[block, power, (j * {size} + k) * {LANES} + i]
+"""
     return f"""\
 for lane in range({LANES}):
     i = lane
     if {r.changed} > 0.0:
         power = int({r.power})
-{body}
-"""
+        for j in range({size}):
+            for k in range({size}):
+                {entry(r.flow)} = powers[block, power, (j * {size} + k) * {LANES} + i]
+            for k in range({half}):
+                at = (j * {size} + {half} + k) * {LANES} + i
+                {entry(r.force)} = forced[block, power, 0, at]
+                {entry(r.rise)} = forced[block, power, 1, at]
+{bounds}"""
 
 
 def _bend(r: WorkArray) -> str:

@@ -519,6 +519,7 @@ def etd_integrate(
     for b in range(from_lane, to_lane, {LANES}):
         block = b // {LANES}
 {_lanes(w.load_surface(), 2)}
+{textwrap.indent(exponential_integrator.fetch(w.rows), " " * 8)}\
 {_lanes(exponential_integrator.begin(w.rows), 2)}
         for step in range({exponential_integrator.MOST}):
             alive = 0.0

@@ -100,6 +100,11 @@ class WorkArray:
     W = W[skip : skip + {size}]"""
 
 
+def entry(matrix: Sequence[Sequence[str]]) -> str:
+    """Return the text of entry (j, k) of a matrix whose rows were taken one after another."""
+    return matrix[0][0].replace("+", f"+ {GROUPS * LANES} * (j * {len(matrix[0])} + k) +")
+
+
 def code(event: Event) -> str:
     """Return the number that stands for an event in a kernel, as text."""
     return repr(float(event))
