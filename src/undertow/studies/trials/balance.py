@@ -23,7 +23,7 @@ from undertow.optimiser import Budget
 from undertow.plants import Bench, srv02_rig
 from undertow.runtime import estimator_for, for_rig
 from undertow.studies.ledger import Key
-from undertow.studies.trials.steering import CascadeSteering, keeping
+from undertow.studies.trials.steering import cascade_and_kept, keeping
 from undertow.studies.trials.trial import MakeController, Outcome, Result, trial
 
 #: The base case of Tables 1 and 2.
@@ -56,15 +56,8 @@ def controllers(
     estimator does.
     """
     exact = Cascade(belief, objective, warm=Budget(budget))
-    cascade = for_rig(exact, estimator_for(belief, bench))
-    start = cascade.start(x0)
-    once = start[1].surface
-    assert once is not None  # start() raises otherwise
-    return {
-        "base": keeping(belief, BASE),
-        "one-time": keeping(belief, once),
-        "cascade": lambda _: CascadeSteering(cascade, start),
-    }
+    cascade, once = cascade_and_kept(for_rig(exact, estimator_for(belief, bench)), x0)
+    return {"base": keeping(belief, BASE), "one-time": once, "cascade": cascade}
 
 
 @lru_cache(maxsize=2)

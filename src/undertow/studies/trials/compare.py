@@ -27,7 +27,12 @@ from undertow.objective import Objective
 from undertow.plants import Bench
 from undertow.plants.bench import bench_for
 from undertow.runtime import estimator_for
-from undertow.studies.trials.steering import CascadeSteering, clipped_regulator, keeping, predictive
+from undertow.studies.trials.steering import (
+    cascade_and_kept,
+    clipped_regulator,
+    keeping,
+    predictive,
+)
 from undertow.studies.trials.trial import MakeController, Outcome, trial
 
 #: What :func:`compare` takes for a controller.
@@ -218,8 +223,7 @@ def _maker(
 ) -> MakeController:
     """Return what makes the controller of one run."""
     if isinstance(controller, Cascade):
-        first = controller.start(start)
-        return lambda _: CascadeSteering(controller, first)
+        return cascade_and_kept(controller, start)[0]
     if isinstance(controller, Surface):
         return keeping(mechanism, controller)
     return controller
