@@ -10,12 +10,12 @@ from typing import Any, TypeVar
 import numpy as np
 
 from undertow.base import (
-    InvalidInputError,
     as_text,
     at_least,
     checked,
     number,
     positive,
+    require,
     require_extra,
     table,
 )
@@ -186,8 +186,7 @@ def compare(
     InvalidInputError
         When there is nothing to compare.
     """
-    if not controllers:
-        raise InvalidInputError("controllers to compare", value="none", limit="at least one")
+    require(controllers, "controllers to compare", "none", "at least one")
     positive("length of a trial, s", seconds)
     at_least("seed", seed, 0)
     start = mechanism.initial_state(x0, state)
