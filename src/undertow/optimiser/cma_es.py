@@ -13,13 +13,11 @@ from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from undertow.base import at_least, positive, require
+from undertow.models import FloatArray
 from undertow.symbolic import compiled
-
-FloatArray = NDArray[np.float64]
 
 
 class Search(Protocol):
