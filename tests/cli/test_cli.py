@@ -33,6 +33,7 @@ from undertow.cli.parsing import (
 )
 from undertow.cli.terminal import progress_bar
 from undertow.closed_loop import Event, Trajectory
+from undertow.closed_loop.trajectory import recorded
 from undertow.studies.motion import ended
 
 RIG = "rotary_pendulum"
@@ -404,12 +405,10 @@ def test_a_box_binds_the_motion_and_one_that_breaks_is_named() -> None:
 def test_the_end_of_a_motion_names_what_it_broke(rig: ut.Mechanism) -> None:
     """The states outside their boxes, else the hard limit: for people."""
     goal = objective_named("time", rig, 5.0, ["theta=5deg", "phi=-90deg:90deg"], hard_input=True)
-    row = np.zeros((1, 1))
 
     def motion(**state: float) -> ut.Trajectory:
-        x = rig.state(**state)[None]
-        end = ut.Event.CONSTRAINT
-        return ut.Trajectory(rig, np.array([0.25]), x, row, row, row[0], row[0], end)
+        row = np.append(rig.state(**state), np.zeros(2 * rig.m + 2))[None]
+        return recorded(rig, np.array([0.25]), row, ut.Event.CONSTRAINT, goal)
 
     assert ended(motion(theta=0.1), goal) == "broke |theta| ≤ 5°, at 0.250 s"
     both = ended(motion(theta=0.1, phi=-1.6), goal)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 from pathlib import Path
@@ -41,7 +42,7 @@ def test_help_has_examples_that_parse() -> None:
 def test_what_is_typed_reaches_the_run_and_what_it_says_the_person(tmp_path: Path) -> None:
     """Units in, units out; the run's own reason where it refuses; where it is, without words."""
     log = tmp_path / "run.db"
-    with Listener(Steered(), log):
+    with contextlib.closing(Listener(Steered(), log)):
         code, out, _ = run("target", str(log))
         assert code == 0
         assert out.splitlines() == [

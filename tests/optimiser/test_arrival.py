@@ -10,7 +10,8 @@ import pytest
 
 import undertow as ut
 from support import rest_slow
-from undertow.optimiser.arrival import ArrivalSearch, FloatArray, _steps, closer
+from undertow.models import FloatArray
+from undertow.optimiser.arrival import ArrivalSearch, _steps, closer
 
 RADIUS = 1e-3
 SLOW = pytest.mark.slow

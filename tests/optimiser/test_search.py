@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from undertow.base import InvalidInputError
+from undertow.models import FloatArray
 from undertow.optimiser import CMAES
-from undertow.optimiser.cma_es import FloatArray, minimise
+from undertow.optimiser.cma_es import minimise
 
 Cost = Callable[[FloatArray], FloatArray]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import os
@@ -321,7 +322,7 @@ def told() -> Told:
 def log(told: Told, tmp_path: Path) -> Iterator[Path]:
     """The log of a run that listens."""
     path = tmp_path / "run.db"
-    with Listener(told, path) as listener:
+    with contextlib.closing(Listener(told, path)) as listener:
         assert not listener.failure
         yield path
     assert not address_path(path).exists()
@@ -451,7 +452,7 @@ def test_an_answer_that_is_none_is_refused(tmp_path: Path) -> None:
 def test_a_run_that_cannot_listen_goes_on(tmp_path: Path, told: Told) -> None:
     """A folder in the place of the address: the reason is kept."""
     address_path(tmp_path / "run.db").mkdir()
-    with Listener(told, tmp_path / "run.db") as listener:
+    with contextlib.closing(Listener(told, tmp_path / "run.db")) as listener:
         assert listener.failure
     assert address_path(tmp_path / "run.db").is_dir()
 

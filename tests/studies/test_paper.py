@@ -37,7 +37,7 @@ def result() -> paper.Reproduction:
     effort = paper.Effort(
         ut.Budget(400), ut.Budget(33), bounds=False, appendix=False, conditions=("matched",)
     )
-    return paper.reproduce(effort=effort)
+    return paper.reproduction(effort=effort).run()
 
 
 @pytest.fixture(scope="module")

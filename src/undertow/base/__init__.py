@@ -17,6 +17,7 @@ from undertow.base.arguments import (
     one_for_each,
     one_of,
     positive,
+    require,
 )
 from undertow.base.artefacts import (
     as_text,
@@ -103,6 +104,7 @@ __all__ = [
     "printable",
     "raised_at",
     "read_file",
+    "require",
     "require_extra",
     "table",
     "to_csv",

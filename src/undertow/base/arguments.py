@@ -119,6 +119,25 @@ Give a number in SI units: undertow.deg(10) for an angle of 10°
     return call
 
 
+def require(
+    good: object,
+    what: str,
+    value: object = None,
+    limit: object = None,
+    remedy: str = "",
+    error: type[UndertowError] = InvalidInputError,
+) -> None:
+    """Refuse what is not as it has to be.
+
+    Raises
+    ------
+    InvalidInputError
+        Or another ``error``, with the value, the limit and the remedy.
+    """
+    if not good:
+        raise error(what, value=value, limit=limit, remedy=remedy)
+
+
 def at_least(what: str, value: float, low: float, remedy: str = "") -> None:
     """Refuse a number below a limit, and NaN.
 
@@ -127,13 +146,8 @@ def at_least(what: str, value: float, low: float, remedy: str = "") -> None:
     InvalidInputError
         With the value and the limit.
     """
-    if not value >= low:
-        raise InvalidInputError(
-            what,
-            value=value,
-            limit=f"≥ {low:g}",
-            remedy=remedy or f"Any whole number from {low:g} will do",
-        )
+    remedy = remedy or f"Any whole number from {low:g} will do"
+    require(value >= low, what, value, f"≥ {low:g}", remedy)
 
 
 def between(
@@ -217,12 +231,8 @@ def one_of(
     """
     known = list(names)
     if name not in known:
-        raise error(
-            what,
-            value=repr(name),
-            limit=f"one of {', '.join(known)}",
-            remedy=f"{near(str(name), known)} {remedy}".strip(),
-        )
+        remedy = f"{near(str(name), known)} {remedy}".strip()
+        raise error(what, value=repr(name), limit=f"one of {', '.join(known)}", remedy=remedy)
 
 
 def check_fields(instance: Any, *names: str) -> None:

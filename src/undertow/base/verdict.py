@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from decimal import ROUND_CEILING, ROUND_DOWN, ROUND_FLOOR, Context, Decimal
+from fractions import Fraction
 from typing import Any, Literal
 
 #: ``proved``: exact or outward-rounded arithmetic over the whole set.  ``sampled``: a
@@ -14,7 +15,7 @@ from typing import Any, Literal
 Kind = Literal["proved", "sampled", "refuted", "undecided"]
 
 
-def inward(value: float, digits: int = 4) -> str:
+def inward(value: float | Fraction, digits: int = 4) -> str:
     """Return a margin or extent as text, rounded towards 0, so that it claims no more.
 
     Examples
@@ -25,20 +26,30 @@ def inward(value: float, digits: int = 4) -> str:
     return _rounded(value, digits, ROUND_DOWN)
 
 
-def within(low: float, high: float, digits: int = 6) -> str:
+def within(low: float | Fraction, high: float | Fraction) -> str:
     """Return an interval as text, its ends rounded inwards, or exactly where it has no room."""
-    ends = _rounded(low, digits, ROUND_CEILING), _rounded(high, digits, ROUND_FLOOR)
-    if not low <= float(ends[0]) <= float(ends[1]) <= high:
+    ends = _rounded(low, 6, ROUND_CEILING), _rounded(high, 6, ROUND_FLOOR)
+    if not low <= Fraction(ends[0]) <= Fraction(ends[1]) <= high:
         ends = repr(float(low)), repr(float(high))
     return f"[{ends[0]}, {ends[1]}]"
 
 
-def _rounded(value: float, digits: int, rounding: str) -> str:
-    """Round to a number of decimal digits; a value with fewer digits stays as it is."""
-    if not math.isfinite(value):
-        return f"{value:g}"
-    shortest = Decimal(repr(float(value)))
-    return f"{float(Context(prec=digits, rounding=rounding).plus(shortest)):.{digits}g}"
+def _rounded(value: float | Fraction, digits: int, rounding: str) -> str:
+    """Round to some digits; a double that its shortest decimal names in as many stays as it is."""
+    try:
+        near = float(value) + 0.0  # −0 is 0
+    except OverflowError:
+        near = 0.0
+    if not math.isfinite(near):
+        return f"{near:g}"
+    exact = value if isinstance(value, Fraction) else Fraction(near)
+    if Fraction(near) == exact:
+        short = Decimal(repr(near)).normalize()
+        if len(short.as_tuple().digits) <= digits:
+            return f"{near:.{digits}g}"
+    context = Context(prec=digits, rounding=rounding)
+    rounded = context.divide(Decimal(exact.numerator), Decimal(exact.denominator))
+    return f"{float(rounded):.{digits}g}"
 
 
 @dataclass(frozen=True)

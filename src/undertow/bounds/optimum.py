@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -12,7 +11,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import InfeasibleError, InvalidInputError, at_least, checked, require_extra
+from undertow.base import (
+    InfeasibleError,
+    InvalidInputError,
+    at_least,
+    checked,
+    positive,
+    require_extra,
+)
 from undertow.bounds.guesses import built_in, recorded
 from undertow.bounds.mesh import hermite
 from undertow.bounds.programme import Programme, Solution
@@ -251,8 +257,7 @@ def _check(
                 limit=f"in its range [{coordinate.low:g}, {coordinate.high:g}]",
             )
     longest = objective.horizon if horizon is None else float(horizon)
-    if not (math.isfinite(longest) and longest > 0):
-        raise InvalidInputError("horizon of the bound", value=longest, limit="finite and > 0 s")
+    positive("horizon of the bound, s", longest)
     at_least("intervals of the first mesh", intervals, 10)
     objective.check_start(mechanism, start)
     return longest

@@ -6,7 +6,6 @@ goes in and out as ``state``, one entry for each episode, as that of a recurrent
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
@@ -228,13 +227,9 @@ def policy(
         )
     mechanism = controller.mechanism
     for given in mechanism.inputs:
-        if not math.isfinite(given.limit):
-            raise InvalidInputError(
-                f"limit of input '{given.name}' of '{mechanism.name}'",
-                value=given.limit,
-                limit="finite: an action of 1 is the whole input",
-                remedy=f"Give the mechanism an Input({given.name!r}, limit=…)",
-            )
+        what = f"limit of input '{given.name}' of '{mechanism.name}'"
+        remedy = f"Give it an Input({given.name!r}, limit=…): an action of 1 is the whole input"
+        positive(what, given.limit, remedy)
     controller.reaching.check_period("period of a policy", period, mechanism.m)
     if cascade is not None:
         count = cascade.period / period

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from undertow.base import InvalidInputError, write_file
+from undertow.base import InvalidInputError, require, write_file
 from undertow.cli.terminal import command, completed, end_interrupted, exit_unless, show
 
 if TYPE_CHECKING:
@@ -97,10 +97,8 @@ def campaign(
         "--shard": shard is not None,
     }  # fmt: skip
     asked = [name for name, given in views.items() if given]
-    if len(asked) > 1:
-        raise InvalidInputError(
-            "what is shown of the campaign", value=" and ".join(asked), limit="one of them"
-        )
+    both = " and ".join(asked)
+    require(len(asked) < 2, "what is shown of the campaign", both, "one of them")
     if proof is not None and picture is None:
         raise InvalidInputError(
             "--proof", value="no --picture", limit="a picture that shows it",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from undertow.base import InvalidInputError, Progress, one_of
+from undertow.base import Progress, one_of, require
 from undertow.cascade import Cascade
 from undertow.cli import options
 from undertow.cli.parsing import (
@@ -37,9 +37,8 @@ def _box(mechanism: Mechanism, within: list[str] | None) -> dict[str, tuple[floa
     box = {}
     for name, percent in parse_values(within).items():
         one_of(f"--within {name}={percent:g}", name, own)
-        if not 0 < percent < 100:
-            what, limit = f"--within {name}={percent:g}", "between 0 and 100 per cent"
-            raise InvalidInputError(what, value=f"{percent:g}", limit=limit)
+        what, limit = f"--within {name}={percent:g}", "between 0 and 100 per cent"
+        require(0 < percent < 100, what, f"{percent:g}", limit)
         ends = own[name] * (1 - percent / 100), own[name] * (1 + percent / 100)
         box[name] = (min(ends), max(ends))
     return box
@@ -111,24 +110,17 @@ def certify(
     timed, own = seconds is None or 0 <= seconds < 1e5, "an option of the loop's proof"
     effort = certification.LOOP_SECONDS if loop_seconds is None else loop_seconds
     region = not run and (bool(seconds) if seconds is not None or appendix else True)
-    for good, what, value, limit in (
-        (appendix == (name is None), "undertow certify", given, "a mechanism, or --appendix"),
-        (not (run and surface is not None), "--surface with --run", surface, alone),
-        (timed, "--seconds", seconds, "in [0, 100000)"),
-        (0 < effort < 1e5, "--loop-seconds", loop_seconds, "in (0, 100000)"),
-        (loop or loop_seconds is None, "--loop-seconds", "without --loop", own),
-        (loop or not hold, "--hold", "without --loop", own),
-        (
-            loop or region or not within,
-            "--within",
-            "without a region and --loop",
-            "an option of their proofs",
-        ),
-        (0 <= hold <= 100, "--hold", hold, whole),
-        (not (loop and within) or hold, "--within with --loop", "no --hold", "a held input"),
-    ):
-        if not good:
-            raise InvalidInputError(what, value=value, limit=limit)
+    require(appendix == (name is None), "undertow certify", given, "a mechanism, or --appendix")
+    require(not (run and surface is not None), "--surface with --run", surface, alone)
+    require(timed, "--seconds", seconds, "in [0, 100000)")
+    require(0 < effort < 1e5, "--loop-seconds", loop_seconds, "in (0, 100000)")
+    require(loop or loop_seconds is None, "--loop-seconds", "without --loop", own)
+    require(loop or not hold, "--hold", "without --loop", own)
+    bears = loop or region or not within
+    require(bears, "--within", "without a region and --loop", "an option of their proofs")
+    require(0 <= hold <= 100, "--hold", hold, whole)
+    held = not (loop and within) or hold
+    require(held, "--within with --loop", "no --hold", "a held input")
     check_out(out)
     report: Any
     with progress_bar() as progress:

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from undertow.base import InvalidInputError, ModelError, one_of
+from undertow.base import InvalidInputError, ModelError, one_of, require
 from undertow.law import Reference, SetPoints, Surface, Target
 from undertow.mechanisms.named import DataName, named
 from undertow.models import FloatArray, Mechanism, invariant_coordinates, normal_name
@@ -62,10 +62,8 @@ def aimed(name: str, target: Sequence[str] | None) -> tuple[str, list[str]]:
     words = [word for word in target or () if word in WORDS]
     rest = [word for word in target or () if word not in WORDS]
     data = DataName.of(name)
-    if len(words) > 1:
-        raise InvalidInputError(
-            "target", value=" and ".join(words), limit="one equilibrium", remedy="Keep one of them"
-        )
+    both = " and ".join(words)
+    require(len(words) < 2, "target", both, "one equilibrium", "Keep one of them")
     if data is None and words:
         raise InvalidInputError(
             "target",
@@ -74,10 +72,7 @@ def aimed(name: str, target: Sequence[str] | None) -> tuple[str, list[str]]:
             remedy="A set-point is written --target x=1m",
         )
     if data is None or data.target:
-        if words:
-            raise InvalidInputError(
-                "target", value=f"{words[0]} beside {name}", limit="one of them"
-            )
+        require(not words, "target", f"{both} beside {name}", "one of them")
         return name, rest
     places = [word for word in rest if "=" in word and "@" not in word and not _is_csv(word)]
     if places and not words:
@@ -146,10 +141,7 @@ def _pairs(words: Sequence[str] | None, example: str) -> dict[str, str]:
     found: dict[str, str] = {}
     for word in words or ():
         name, value = _split(word, example)
-        if name in found:
-            raise InvalidInputError(
-                "settings", value=f"'{name}' twice", limit="each name once", remedy="Keep one"
-            )
+        require(name not in found, "settings", f"'{name}' twice", "each name once", "Keep one")
         found[name] = value
     return found
 
@@ -311,10 +303,7 @@ def _target_of_words(
         example = f"{one}@2s or {one}@0.5Hz"
         time, kind = _quantity(when, ("s", "Hz"), f"target '{name}'", example) if at else (0.0, "s")
         group = (points if kind == "s" else sines).setdefault(time, {})
-        if name in group:
-            raise InvalidInputError(
-                "target", value=f"'{name}' twice", limit="each name once at a time"
-            )
+        require(name not in group, "target", f"'{name}' twice", "each name once at a time")
         group[name] = number * UNITS[unit][2]
     if sines and (points or len(sines) > 1):
         raise InvalidInputError(

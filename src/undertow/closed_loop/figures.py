@@ -19,7 +19,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from undertow.base import InvalidInputError
+from undertow.base import require
 from undertow.closed_loop.trajectory import Trajectory
 from undertow.models import Coordinate, FloatArray, Mechanism
 from undertow.symbolic.formulas import plain_symbol
@@ -160,8 +160,7 @@ def motion_figure(
     >>> len(motion_figure({"printed surface": motion}).axes)
     3
     """
-    if not trajectories:
-        raise InvalidInputError("motions to draw", value="none", limit="at least one")
+    require(trajectories, "motions to draw", "none", "at least one")
     first = next(iter(trajectories.values()))
     mechanism = first.mechanism
     rows = mechanism.n + mechanism.m

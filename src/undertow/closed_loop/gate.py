@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from undertow.base import Verdict
 from undertow.closed_loop.rollout import ClosedLoop
-from undertow.closed_loop.trajectory import INADMISSIBLE, INPUT_LIMIT, Batch, Event
+from undertow.closed_loop.trajectory import INADMISSIBLE, Batch, Event, broken_words
 from undertow.law import Plan, stability_margin
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import Objective
@@ -43,8 +43,7 @@ def broken_by(loop: ClosedLoop, batch: Batch, k: int) -> str:
     """Return the names of the constraints that ended motion k of a batch; none did: nothing."""
     if batch.event[k] != Event.CONSTRAINT:
         return ""
-    named = zip(loop.objective.constraints, batch.path[k], strict=True)
-    return " and ".join(c.name for c, margin in named if not margin >= 0) or INPUT_LIMIT
+    return broken_words((c.name for c in loop.objective.constraints), batch.path[k])
 
 
 def cost_gate(loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: float) -> Admission:

@@ -29,6 +29,7 @@ from undertow.base import (
     checked,
     floats,
     positive,
+    require,
 )
 from undertow.closed_loop.adaptive_integrator import follow
 from undertow.closed_loop.buffers import NOTHING, RolloutBuffers
@@ -618,8 +619,7 @@ class ClosedLoop:
                 value=f"shape {vectors.shape}",
                 limit=f"(N, {len(switch_times)}, {expected})",
             )
-        if vectors.shape[0] == 0:
-            raise InvalidInputError("batch of rollouts", value="no surface", limit="at least one")
+        require(len(vectors), "batch of rollouts", "no surface", "at least one")
         if not np.isfinite(vectors).all():
             raise InvalidInputError(
                 "surface vectors of a batch",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from html import escape
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from undertow.base import at_least, checked, one_of, require_extra
 from undertow.models import FloatArray, Mechanism
-from undertow.objective.objective import Objective, broken_constraints
+from undertow.objective.objective import Objective, margins_at
 from undertow.symbolic import compiled
 
 if TYPE_CHECKING:
@@ -288,6 +288,12 @@ class Trajectory:
         )
 
 
+def broken_words(names: Iterable[str], margins: Iterable[float]) -> str:
+    """Return what a motion broke that a constraint ended: those whose margin is not ≥ 0."""
+    named = zip(names, margins, strict=True)
+    return " and ".join(name for name, margin in named if not margin >= 0) or INPUT_LIMIT
+
+
 def recorded(
     mechanism: Mechanism, t: FloatArray, rows: FloatArray, event: int, objective: Objective
 ) -> Trajectory:
@@ -297,7 +303,8 @@ def recorded(
     x, u, s, cost, margin = parts
     broken = ""
     if event == Event.CONSTRAINT:
-        broken = broken_constraints(objective, mechanism, x[-1], u[-1]) or INPUT_LIMIT
+        names = [constraint.words for constraint in objective.constraints]
+        broken = broken_words(names, margins_at(objective, mechanism, x[-1], u[-1]))
     return Trajectory(
         mechanism, t, x, u, s, cost[:, 0], margin[:, 0], Event(event), objective.unit, broken
     )

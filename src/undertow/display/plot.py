@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from undertow.base import InvalidInputError
+from undertow.base import require
 from undertow.closed_loop import Trajectory
 from undertow.closed_loop.figures import axis, display
 from undertow.law import Surface
@@ -44,11 +44,8 @@ def surface_trace(
     InvalidInputError
         When there are several surfaces at once, m > 1: then s = 0 fixes no single velocity.
     """
-    mechanism = trajectory.mechanism
-    if mechanism.m != 1:
-        raise InvalidInputError(
-            f"surface trace of '{mechanism.name}'", value=f"m = {mechanism.m}", limit="m = 1"
-        )
+    mechanism, m = trajectory.mechanism, trajectory.mechanism.m
+    require(m == 1, f"surface trace of '{mechanism.name}'", f"m = {m}", "m = 1")
     x, _ = axis(trajectory, name)
     y, _ = axis(trajectory, f"{name}_dot")
     index = [c.name for c in mechanism.coordinates].index(name)

@@ -17,7 +17,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import InvalidInputError, one_for_each, positive
+from undertow.base import InvalidInputError, one_for_each, one_of, positive, require
 from undertow.export.estimate import DerivativeStep, EstimatorStep, KalmanStep
 from undertow.export.names import HEADERS, c_name
 from undertow.law import LawLayout, Plan, ReachingLaw, SlidingModeLaw, Surface, check_surface
@@ -114,25 +114,13 @@ class EmbeddedController:
         """Refuse what cannot run: see the class."""
         limits = self.mechanism.input_limits
         built_in = len(self.plan.surfaces)
-        for what, value, good, limit in (
-            ("period of the exported loop", self.period, 0 < self.period < 1, "> 0, < 1 s"),
-            ("missed periods", self.missed, self.missed >= 0, "0 or more"),
-            ("real", repr(self.real), self.real in ("double", "float"), "'double' or 'float'"),
-            (
-                "prefix",
-                repr(self.prefix),
-                re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,15}", self.prefix) is not None,
-                "a C name of at most 16 letters",
-            ),
-            (
-                "rows of the surface table",
-                self.most_rows,
-                built_in <= self.most_rows <= 64,
-                f"{built_in} (those of the plan) to 64",
-            ),
-        ):
-            if not good:
-                raise InvalidInputError(what, value=value, limit=limit)
+        named = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,15}", self.prefix)
+        rows, plan_to_most = self.most_rows, f"{built_in} (those of the plan) to 64"
+        require(0 < self.period < 1, "period of the exported loop", self.period, "> 0, < 1 s")
+        require(self.missed >= 0, "missed periods", self.missed, "0 or more")
+        one_of("real", self.real, ("double", "float"))
+        require(named, "prefix", repr(self.prefix), "a C name of at most 16 letters")
+        require(built_in <= rows <= 64, "rows of the surface table", rows, plan_to_most)
         positive(
             f"input limits of '{self.mechanism.name}'",
             limits,

@@ -164,10 +164,10 @@ class Build:
         """Start the controller as a process of its own."""
         return HostProcess(self.controller, self.pipe())
 
-    def agreement(self, count: int = 100_000, seed: int = 0) -> Agreement:
+    def agreement(self, count: int = 100_000) -> Agreement:
         """Compare the law with :class:`undertow.SlidingModeLaw` at random states."""
         mechanism = self.controller.mechanism
-        states = random_states(mechanism, count, seed)
+        states = random_states(mechanism, count)
         if self.controller.real == "float":
             states = states.astype(np.float32).astype(float)
         lines = "\n".join("l " + " ".join(map(repr, row)) for row in states.tolist())

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from undertow.base import InvalidInputError, check_fields, checked, one_of, require_extra
+from undertow.base import InvalidInputError, check_fields, checked, one_of, require, require_extra
 from undertow.closed_loop import ClosedLoop
 from undertow.law import (
     InnerLoop,
@@ -293,10 +293,7 @@ def phase_plane(system: Any, across: str, along: str, **others: float) -> Any:
     names = list(system.state_labels)
     for name in (across, along, *others):
         one_of("state of a phase plane", name, names)
-    if across == along:
-        raise InvalidInputError(
-            "states of a phase plane", value=(across, along), limit="two different ones"
-        )
+    require(across != along, "states of a phase plane", (across, along), "two different ones")
     places = [names.index(across), names.index(along)]
     held = np.array([others.get(name, 0.0) for name in names])
     nothing = np.zeros(system.ninputs)

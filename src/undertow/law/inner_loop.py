@@ -57,7 +57,10 @@ class InnerLoop:
 
     def __post_init__(self) -> None:
         """Set out the arrays that every step fills."""
-        memory = law_memory(self.mechanism)
+        mechanism = self.mechanism
+        memory = Workspace(LAYOUT, p=len(mechanism.parameters), m=mechanism.m)
+        memory["parameters"][:] = mechanism.parameter_values
+        memory["limits"][:] = mechanism.input_limits
         self.u, self.demand, self.s = memory["u"], memory["demand"], memory["s"]
         self.margin, self._block = memory["margin"], memory.block
         self.parameters: FloatArray = memory["parameters"]
@@ -140,14 +143,6 @@ def feedback_at_target(
     return k
 
 
-def law_memory(mechanism: Mechanism, limits: FloatArray | None = None) -> Workspace:
-    """Return what a step of a law works on: u, demand, s, margin; limits may be narrower."""
-    memory = Workspace(LAYOUT, p=len(mechanism.parameters), m=mechanism.m)
-    memory["parameters"][:] = mechanism.parameter_values
-    memory["limits"][:] = mechanism.input_limits if limits is None else limits
-    return memory
-
-
 def pack_law_parameters(law: SlidingModeLaw) -> FloatArray:
     """Return the numbers of a law in the order of the kernels: surface, η, ε, det Γ(0)."""
     reaching = law.reaching.vector(law.mechanism.m)
@@ -174,7 +169,7 @@ def step(x, lane, block):
 
 @lru_cache(maxsize=64)
 def law_module(mechanism: Mechanism, switching: Switching) -> Any:
-    """Return the compiled module of a law: ``law``, and ``step`` on a :func:`law_memory`."""
+    """Return the compiled module of a law: ``law``, and ``step`` on a :data:`LAYOUT`."""
 
     def functions() -> tuple[str, str]:
         tape, symbols = Tape(), LawSymbols.of(mechanism.n, mechanism.m)

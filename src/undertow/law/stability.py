@@ -26,6 +26,7 @@ from undertow.base import (
     UnstableSurfaceError,
     checked,
     floats,
+    positive,
 )
 from undertow.law.sliding import check_surface_shape, coupling, gamma_determinant, singularity
 from undertow.law.surface import LawLayout, Surface
@@ -259,8 +260,7 @@ def first_surface(
         raise InvalidInputError(
             "weights of the quadratic design", value=list(weights), limit=f"{2 * n} numbers > 0"
         )
-    if not (np.isfinite(rate) and rate >= 0):
-        raise InvalidInputError("convergence rate", value=rate, limit="finite and ≥ 0 1/s")
+    positive("convergence rate, 1/s", rate, zero=True)
     return _quadratic(mechanism, diagonal, rate)
 
 

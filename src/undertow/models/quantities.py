@@ -15,7 +15,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike, NDArray
 
-from undertow.base import InvalidInputError, one_of
+from undertow.base import InvalidInputError, one_of, positive
 
 FloatArray = NDArray[np.float64]
 
@@ -214,8 +214,7 @@ class Parameter(_Named):
         if self.tolerance is not None:
             what = f"tolerance of parameter '{self.name}'"
             tolerance = number_of(what, self.tolerance)
-            if not 0 <= tolerance < math.inf:
-                raise InvalidInputError(what, value=tolerance, limit="finite and ≥ 0")
+            positive(what, tolerance, zero=True)
             object.__setattr__(self, "tolerance", tolerance)
 
     @property

@@ -684,7 +684,7 @@ class Objective:
                 found = margin.subs(values)
                 if not found.is_number:
                     continue  # it depends on the input
-                value = float(found) if found.is_real else math.nan
+                value = _real(found)
                 if not value >= 0:
                     raise InvalidInputError(
                         f"{which} of '{mechanism.name}' breaks '{constraint.words}'",
@@ -819,18 +819,17 @@ class MinimumTime(Objective):
     formula: str = "∫ 1 dt"
 
 
-def broken_constraints(
+def margins_at(
     objective: Objective, mechanism: Mechanism, x: FloatArray, u: FloatArray
-) -> str:
-    """Return the names of the constraints that a state, (2n,), breaks under an input, (m,)."""
+) -> list[float]:
+    """Return the constraints' margins at a state, (2n,), under an input, (m,); NaN for none."""
     values = zip([*mechanism.x, *mechanism.u], [*x.tolist(), *u.tolist()], strict=True)
     known = mechanism.substitution | dict(values)
-    margins = [margin.subs(known) for margin in objective.path_margins(mechanism)]
-    return " and ".join(
-        constraint.words
-        for constraint, margin in zip(objective.constraints, margins, strict=True)
-        if not (margin.is_real and margin >= 0)
-    )
+    return [_real(margin.subs(known)) for margin in objective.path_margins(mechanism)]
+
+
+def _real(value: sp.Expr) -> float:
+    return float(value) if value.is_real else math.nan
 
 
 def _failed(what: str, error: Exception) -> InvalidInputError:

@@ -20,7 +20,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from undertow.models import FloatArray
 
 #: T after an arrival, as a part of the one before.
 SHORTER = 0.97

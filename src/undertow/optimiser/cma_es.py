@@ -13,13 +13,11 @@ from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from undertow.base import InvalidInputError, at_least, positive
+from undertow.base import at_least, positive, require
+from undertow.models import FloatArray
 from undertow.symbolic import compiled
-
-FloatArray = NDArray[np.float64]
 
 
 class Search(Protocol):
@@ -42,10 +40,8 @@ class Search(Protocol):
 
 def check_start(mean: FloatArray, spread: FloatArray, population: int) -> None:
     """Refuse a first guess, a first spread or a population that no search can use."""
-    if not np.isfinite(mean).all():
-        raise InvalidInputError(
-            "mean of the search", value=mean, limit="finite numbers", remedy="Start elsewhere"
-        )
+    finite = np.isfinite(mean).all()
+    require(finite, "mean of the search", mean, "finite numbers", "Start elsewhere")
     positive("sigma of the search", spread, "0.1 is usual")
     at_least("population of the search", population, 4, "16 fills a block of rollouts")
 

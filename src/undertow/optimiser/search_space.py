@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from undertow.base import InvalidInputError, check_fields, positive
+from undertow.base import InvalidInputError, check_fields, positive, require
 from undertow.closed_loop import ClosedLoop
 from undertow.closed_loop.trajectory import Batch
 from undertow.law import LawLayout, Plan, ReachingLaw, Surface, rising_from_zero
@@ -61,10 +61,8 @@ class DecisionVariables:
                 limit="free reaching laws, no other times",
                 remedy="Write DecisionVariables(reaching=True, schedule=0.1)",
             )
-        if not rising_from_zero(self.times):
-            raise InvalidInputError(
-                "times of a schedule", value=self.times, limit="rising times from 0 s"
-            )
+        rising = rising_from_zero(self.times)
+        require(rising, "times of a schedule", self.times, "rising times from 0 s")
 
     @property
     def plainer(self) -> DecisionVariables | None:

@@ -15,7 +15,8 @@ import numpy as np
 from scipy.linalg import lapack
 
 from undertow.closed_loop import INADMISSIBLE
-from undertow.optimiser.cma_es import FloatArray, check_start
+from undertow.models import FloatArray
+from undertow.optimiser.cma_es import check_start
 from undertow.symbolic import compiled
 
 #: Lengths tried along a step of the model.

@@ -14,7 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from undertow.base import InvalidInputError, at_least, between, one_of, positive
+from undertow.base import InvalidInputError, at_least, between, one_of, positive, require
 from undertow.mechanisms import rotary_pendulum
 from undertow.models import FloatArray, Mechanism, Parameter
 
@@ -286,10 +286,7 @@ class Bench:
             for name in names:
                 one_of(f"{what} of a bench of '{mechanism.name}'", name, known)
         wild = {k: v for k, v in self.tolerance.items() if not 0 <= v < 1}
-        if wild:
-            raise InvalidInputError(
-                "tolerance of a bench", value=wild, limit="in [0, 1)", remedy="0.05 is 5 %"
-            )
+        require(not wild, "tolerance of a bench", wild, "in [0, 1)", "0.05 is 5 %")
 
     def drawn(self, rng: np.random.Generator) -> Mechanism:
         """Return the mechanism with parameters drawn within their tolerances."""

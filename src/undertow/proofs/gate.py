@@ -29,14 +29,13 @@ from typing import Literal
 
 import numpy as np
 
-from undertow.base.arguments import at_least
+from undertow.base.arguments import at_least, require
 from undertow.base.verdict import Verdict
 from undertow.closed_loop.gate import Admission, Gate, cost_gate
 from undertow.closed_loop.rollout import ClosedLoop
 from undertow.closed_loop.trajectory import Batch, Event
 from undertow.law import Plan, ProvedSet, ReachingLaw, Surface, stability_margin
 from undertow.models.mechanism import FloatArray
-from undertow.proofs.require import require
 from undertow.proofs.search.terminal_ellipsoid import EllipsoidSearch, search_for
 
 Evidence = Literal["region", "dual", "sampled", "local"]

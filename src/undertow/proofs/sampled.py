@@ -12,12 +12,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from undertow.base.arguments import require
 from undertow.base.verdict import Verdict
 from undertow.closed_loop.rollout import ClosedLoop
 from undertow.closed_loop.trajectory import Event
 from undertow.law import Surface
 from undertow.models.mechanism import FloatArray, Mechanism
-from undertow.proofs.require import require
 
 #: Draws starts x0, (N, 2n), from a generator.
 Sampler = Callable[[np.random.Generator, int], FloatArray]

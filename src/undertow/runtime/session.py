@@ -185,7 +185,7 @@ def session(
             runtime = Runtime(controller, plant, worker, clock=clock, log=book, lockstep=double)
             if log is not None and not simulated:
                 with signals_deferred():
-                    listener = stack.enter_context(Listener(runtime, log))
+                    listener = stack.enter_context(contextlib.closing(Listener(runtime, log)))
                 runtime.deaf = listener.failure
             tell("ready", 1.0)
             signals.runtime = runtime

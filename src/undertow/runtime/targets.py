@@ -19,8 +19,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -193,17 +192,6 @@ class Listener:
             with contextlib.suppress(OSError):
                 self.path.unlink(missing_ok=True)
         self._door.close()
-
-    def __enter__(self) -> Self:
-        """Return the listener."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:  # fmt: skip
-        """Listen no more."""
-        self.close()
 
     def _listen(self) -> None:
         while not self._over.is_set():

@@ -13,10 +13,9 @@ from undertow.base import facts, finite, manifest, mark, table, to_csv
 from undertow.cascade import Cascade, Gate, Run, Update, problem_words
 from undertow.closed_loop import Event, Trajectory
 from undertow.closed_loop.figures import display, figure_bytes, motion_figure, state_words
-from undertow.closed_loop.trajectory import INPUT_LIMIT
 from undertow.law import Surface, Target
 from undertow.models import FloatArray, Mechanism
-from undertow.objective.objective import Objective, broken_constraints
+from undertow.objective import Objective
 from undertow.optimiser import Proposal
 
 _ENDINGS = {
@@ -25,6 +24,12 @@ _ENDINGS = {
     Event.CONSTRAINT: "broke {broken}",
     Event.SINGULAR: "met the singularity (37): the law does not exist further on",
     Event.DIVERGED: "diverged",
+}
+
+#: The same of a motion along a reference.
+_ALONG = {
+    Event.REACHED: "followed the reference to the end, where {off} ≤ {radius:g}",
+    Event.HORIZON: "was off the reference at the end: {off} = {norm:.3g}, not ≤ {radius:g}",
 }
 
 
@@ -43,48 +48,21 @@ def _head(
     ]
 
 
-#: The same of a motion along a reference.
-_ALONG = {
-    Event.REACHED: "followed the reference to the end, where {off} ≤ {radius:g}",
-    Event.HORIZON: "was off the reference at the end: {off} = {norm:.3g}, not ≤ {radius:g}",
-}
-
-
 def ended(motion: Trajectory, objective: Objective, target: Target | None = None) -> str:
-    """Say in words how a motion ended; ``target`` where that is not x = 0."""
+    """Say in words how a motion ended.
+
+    With a ``target`` that is not x = 0 what counts is how far it is off that.
+    """
+    words, off, error, radius = _ENDINGS, "‖x‖", motion.x[-1], objective.terminal_radius
     if target is not None:
-        return _ended_at(motion, objective, target)
-    if motion.event == Event.REACHED and motion.time == motion.t[0]:
-        return (
-            f"started at the target, ‖x‖ ≤ {objective.terminal_radius:g}: there was nothing to do"
-        )
-    return _ended(_ENDINGS, motion, objective, motion.x[-1], "‖x‖")
-
-
-def _ended_at(motion: Trajectory, objective: Objective, target: Target) -> str:
-    """Say how a motion to a target elsewhere ended: what counts is how far it is off that."""
-    legs = target.legs(motion.mechanism, max(motion.time, objective.horizon))
-    begun = [leg for begin, leg in legs if begin <= motion.time]
-    words = _ENDINGS | _ALONG if begun[-1].moves else _ENDINGS
-    return _ended(
-        words, motion, objective, motion.x[-1] - begun[-1].state(motion.time), "‖x − x_r‖"
-    )
-
-
-def _ended(
-    words: Mapping[Event, str],
-    motion: Trajectory,
-    objective: Objective,
-    error: FloatArray,
-    off: str,
-) -> str:
-    broken = ""
-    if motion.event == Event.CONSTRAINT:
-        mechanism = motion.mechanism
-        problem = objective.on(mechanism)
-        broken = broken_constraints(problem, mechanism, motion.x[-1], motion.u[-1]) or INPUT_LIMIT
-    radius, norm = objective.terminal_radius, float(np.linalg.norm(error))
-    said = words[motion.event].format(off=off, radius=radius, norm=norm, broken=broken)
+        legs = target.legs(motion.mechanism, max(motion.time, objective.horizon))
+        leg = [leg for begin, leg in legs if begin <= motion.time][-1]
+        words = _ENDINGS | _ALONG if leg.moves else _ENDINGS
+        off, error = "‖x − x_r‖", error - leg.state(motion.time)
+    elif motion.event == Event.REACHED and motion.time == motion.t[0]:
+        return f"started at the target, ‖x‖ ≤ {radius:g}: there was nothing to do"
+    norm = float(np.linalg.norm(error))
+    said = words[motion.event].format(off=off, radius=radius, norm=norm, broken=motion.broken)
     return f"{said}, at {motion.time:.3f} s"
 
 

@@ -23,13 +23,11 @@ from types import ModuleType
 import numpy as np
 import sympy as sp
 
-from undertow.symbolic.machine import numba
+from undertow.symbolic.machine import PACKAGE, numba
 from undertow.symbolic.private import private_folder
 
 #: Texts of a kind that a clearance leaves; one write in 256 clears.
 KEPT = 1024
-
-PACKAGE = Path(__file__).resolve().parent.parent
 
 
 def content_key(*texts: str) -> str:

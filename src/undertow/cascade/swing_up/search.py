@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -278,11 +278,7 @@ def _in_turn(swings: _Swings, rows: Sequence[FloatArray], batch: _Batch) -> list
     return found
 
 
-def search(
-    mechanism: Mechanism,
-    seed: int = 0,
-    progress: Callable[[float], None] = lambda _: None,
-) -> tuple[RatedGains, ...]:
+def search(mechanism: Mechanism, seed: int = 0) -> tuple[RatedGains, ...]:
     """Search for gains that swing a mechanism up, whatever is a little different.
 
     Random gains are tried on a few swings, the best of them on more, and the best one is refined
@@ -290,8 +286,8 @@ def search(
     them, and so on.  Nothing that was found before is looked at.
 
     The mechanism has one input with a limit, a potential, and a target that stands upright.
-    ``seed`` is that of the gains and of the swings; ``progress`` is called with the part done.
-    Gains come in the order in which they are to be tried, none where nothing arrives.
+    ``seed`` is that of the gains and of the swings.  Gains come in the order in which they are to
+    be tried, none where nothing arrives.
 
     Raises
     ------
@@ -305,7 +301,7 @@ def search(
     scale = missing * np.array([inertia, 1.0, 0.1, 1.0, pump])
     seen, fresh = swings.drawn(0, LOOKED), swings.drawn(LOOKED, LOOKED + FRESH)
     found: list[FloatArray] = []
-    for number in range(TURNS):
+    for _ in range(TURNS):
         batch = swings.left(found, seen)[0][:SWINGS]
 
         def merits(some: FloatArray, batch: _Batch = batch) -> FloatArray:
@@ -315,8 +311,7 @@ def search(
         rows = rows[np.argsort(merits(rows, batch[:FEW]), kind="stable")[:GOOD]]
         best = rows[np.argmin(merits(rows))]
         climb = CMAES(np.log(best), 0.3, 12, rng)
-        for generation in range(GENERATIONS):
-            progress((number + generation / GENERATIONS) / TURNS)
+        for _ in range(GENERATIONS):
             asked = climb.ask()
             climb.tell(asked, merits(np.exp(asked)))
         found.append(np.exp(climb.best_x))
@@ -324,11 +319,7 @@ def search(
 
 
 def designs_for(
-    mechanism: Mechanism,
-    *,
-    seed: int = 0,
-    fresh: bool = False,
-    progress: Callable[[float], None] = lambda _: None,
+    mechanism: Mechanism, *, seed: int = 0, fresh: bool = False
 ) -> tuple[RatedGains, ...]:
     """Return what :func:`search` finds, from what is kept where it was found before.
 
@@ -347,7 +338,7 @@ def designs_for(
         text = recall("swing_gains", key)
         if text is not None:
             return _read(json.loads(text))
-    found = search(mechanism, seed, progress)
+    found = search(mechanism, seed)
     if not found:
         raise InfeasibleError(
             f"no gains found that swing up '{mechanism.name}'",
@@ -360,9 +351,9 @@ def designs_for(
     return found
 
 
-def designed(mechanism: Mechanism, *, seed: int = 0) -> SwingUp:
+def designed(mechanism: Mechanism) -> SwingUp:
     """Return the swing-up with the gains that :func:`designs_for` returns: see there."""
-    return SwingUp(mechanism, tuple(one.gains for one in designs_for(mechanism, seed=seed)))
+    return SwingUp(mechanism, tuple(one.gains for one in designs_for(mechanism)))
 
 
 def kept_text(found: Mapping[Mechanism, Sequence[RatedGains]]) -> str:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import sympy as sp
 
-from undertow.base import InvalidInputError, ModelError, checked, floats, one_of
+from undertow.base import InvalidInputError, ModelError, checked, floats, one_of, require
 from undertow.models.importers.equations import check_balanced, shifted
 from undertow.models.importers.tree import LARGEST
 from undertow.models.importers.xml_files import without_rounding
@@ -531,8 +531,6 @@ def _positions(mechanism: Mechanism, values: Mapping[str, float]) -> FloatArray:
         whose = f"coordinate of '{mechanism.name}'"
         one_of(whose, name, names, "Name the coordinates of the mechanism")
     q = np.array([number_of(f"coordinate '{name}'", values.get(name, 0.0)) for name in names])
-    if not np.isfinite(q).all():
-        raise InvalidInputError(
-            f"coordinates of '{mechanism.name}'", value=dict(values), limit="finite numbers"
-        )
+    good = np.isfinite(q).all()
+    require(good, f"coordinates of '{mechanism.name}'", dict(values), "finite numbers")
     return q

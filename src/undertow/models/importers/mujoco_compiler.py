@@ -447,45 +447,17 @@ def urdf_compiled(mujoco: Any, robot: ET.Element, gravity: Vector) -> Any | None
 def compared(
     mechanism: Mechanism, tree: Tree, model: Any, q_target: Mapping[str, float], *, driven: bool
 ) -> str:
-    """Compare a mechanism with MuJoCo's model of the same file, and say in words how they agree.
-
-    Raises
-    ------
-    ModelError
-        As for :func:`compare`.
-    """
-    mujoco = engine()
-    assert mujoco is not None  # it compiled the model
-    worst = compare(mujoco, model, mechanism, tree, q_target, driven=driven)
-    return f"MuJoCo {mujoco.__version__}, {_ALIKE} {worst:.1g}"
-
-
-def agreement(mechanism: Mechanism) -> str:
-    """To what the accelerations of a mechanism from a file are MuJoCo's; nothing where unknown."""
-    said = mechanism.description.partition(_ALIKE)[2]
-    return said.partition("\n")[0].strip()
-
-
-def compare(
-    mujoco: Any,
-    model: Any,
-    mechanism: Mechanism,
-    tree: Tree,
-    q_target: Mapping[str, float],
-    *,
-    driven: bool,
-) -> float:
-    """Return the largest relative difference from the engine's accelerations at random states.
+    """Say in words how a mechanism's accelerations at random states are those of MuJoCo.
 
     Parameters
     ----------
-    mujoco, model
-        The engine and its compiled model of the same file; dry friction, ranges of joints and
-        contacts are switched off in a copy.
     mechanism
         As it was read, with the inputs of ``tree`` or with joints named as actuated.
     tree
         Its bodies and joints.
+    model
+        The engine's compiled model of the same file; dry friction, ranges of joints and contacts
+        are switched off in a copy.
     q_target
         The target in the mechanism's coordinates as they are before it is made zero.
     driven
@@ -494,8 +466,10 @@ def compare(
     Raises
     ------
     ModelError
-        Where the difference is beyond :data:`AGREEMENT`.
+        Where the largest relative difference is beyond :data:`AGREEMENT`.
     """
+    mujoco = engine()
+    assert mujoco is not None  # it compiled the model
     kinds = mujoco.mjtObj
     own = [joint.name for joint in tree.moving]
     read = [joint.name for joint in tree.joints if joint.kind != "fixed"]  # as MuJoCo has them
@@ -536,7 +510,13 @@ def compare(
             remedy="Something in the file moves the bodies and is not read here: take out what "
             "is no joint, body or motor",
         )
-    return worst
+    return f"MuJoCo {mujoco.__version__}, {_ALIKE} {worst:.1g}"
+
+
+def agreement(mechanism: Mechanism) -> str:
+    """To what the accelerations of a mechanism from a file are MuJoCo's; nothing where unknown."""
+    said = mechanism.description.partition(_ALIKE)[2]
+    return said.partition("\n")[0].strip()
 
 
 def _rows(mechanism: Mechanism, tree: Tree, joints: Sequence[str], driven: bool) -> FloatArray:

@@ -12,7 +12,14 @@ from xml.parsers import expat
 
 import numpy as np
 
-from undertow.base import ArtefactError, InvalidInputError, ModelError, error_text, read_file
+from undertow.base import (
+    ArtefactError,
+    InvalidInputError,
+    ModelError,
+    error_text,
+    read_file,
+    require,
+)
 from undertow.models.mechanism import FloatArray
 
 #: Largest file, bytes; deepest nesting, and most elements, of one that is read.
@@ -191,8 +198,7 @@ def numbers_of(
         values = [float(word) for word in _STOP.sub(r"\1", text.replace(",", " ")).split()]
     except ValueError as error:
         raise InvalidInputError(label, value=shown, limit="numbers", remedy=wanted) from error
-    if not all(math.isfinite(v) for v in values):
-        raise InvalidInputError(label, value=shown, limit="finite numbers", remedy=wanted)
+    require(all(map(math.isfinite, values)), label, shown, "finite numbers", wanted)
     if count is not None and not any(values[count:]):  # zeros too many mean nothing
         values = values[:count]
     if count is not None and len(values) != count:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import cast
 
-from undertow.base.arguments import one_of
+from undertow.base.arguments import one_of, require
 from undertow.base.verdict import Kind, Verdict
 from undertow.law import ReachingLaw, Surface, check_surface_shape
 from undertow.models.mechanism import Mechanism
@@ -20,7 +20,6 @@ from undertow.proofs.claims.claim import Box, Claim
 from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.claims.words import sentence
 from undertow.proofs.kernel import claims as kernel
-from undertow.proofs.require import require
 
 #: The least ratio that is asked for.
 TINY = 1e-9

@@ -13,6 +13,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from undertow.base.arguments import require
 from undertow.base.verdict import Kind, Verdict
 from undertow.law import ReachingLaw, Surface
 from undertow.models.mechanism import Mechanism
@@ -25,7 +26,6 @@ from undertow.proofs.kernel.model import Matrix
 from undertow.proofs.kernel.region import Function, Stage, Stretch, on_the_line
 from undertow.proofs.region.lyapunov import LyapunovFunction
 from undertow.proofs.region.motion import SurfaceMotion
-from undertow.proofs.require import require
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from typing import Any, Self, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from undertow.base.arguments import require
 from undertow.base.verdict import Kind, Verdict, inward
 from undertow.law import (
     LawLayout,
@@ -30,7 +31,7 @@ from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.compiled import between
 from undertow.proofs.kernel.graph import Graph, Intervals, Span
 from undertow.proofs.kernel.model import Law, System
-from undertow.proofs.require import require, require_autonomous
+from undertow.proofs.require import require_autonomous
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
+from undertow.base.arguments import require
 from undertow.base.errors import CertificateError, UndertowError
 from undertow.base.verdict import Verdict
 from undertow.law.surface import ProvedSet
@@ -22,6 +24,11 @@ from undertow.proofs.claims.model_data import model_data
 from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.reader import digest
+
+#: What is asked of a certificate.
+_require = partial(require, error=CertificateError)
+
+AGAIN = "The proof is for that value: certify again with --set"
 
 
 @dataclass(frozen=True)
@@ -101,14 +108,6 @@ def match(
         "The model has changed since: certify again",
     )
     return matched
-
-
-AGAIN = "The proof is for that value: certify again with --set"
-
-
-def _require(good: bool, what: str, value: object, limit: object, remedy: str = "") -> None:
-    if not good:
-        raise CertificateError(what, value=value, limit=limit, remedy=remedy)
 
 
 def check_settings(certificate: Certificate, settings: Mapping[str, float]) -> None:

@@ -7,51 +7,22 @@ more than what is decided; a file's own texts are never printed.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from decimal import ROUND_CEILING, ROUND_DOWN, ROUND_FLOOR, Context, Decimal
 from fractions import Fraction
 from functools import singledispatch
 
 import numpy as np
 
+from undertow.base.verdict import inward, within
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.claims import Region
 from undertow.proofs.kernel.model import Model, Quantity
-
-
-def _digits(value: Fraction, digits: int, rounding: str) -> str:
-    """Round to some digits; a double that its shortest decimal names in as many stays as it is."""
-    try:
-        near = value.numerator / value.denominator
-    except OverflowError:
-        near = 0.0
-    if Fraction(near) == value:
-        short = Decimal(repr(near))
-        if len(short.normalize().as_tuple().digits) <= digits:
-            return f"{near:.{digits}g}"
-    context = Context(prec=digits, rounding=rounding)
-    return (
-        f"{float(context.divide(Decimal(value.numerator), Decimal(value.denominator))):.{digits}g}"
-    )
-
-
-def inward(value: Fraction, digits: int = 6) -> str:
-    """Return a number as text, rounded towards 0."""
-    return _digits(value, digits, ROUND_DOWN)
-
-
-def within(low: Fraction, high: Fraction) -> str:
-    """Return an interval as text, its ends rounded inwards, or exactly where it has no room."""
-    ends = _digits(low, 6, ROUND_CEILING), _digits(high, 6, ROUND_FLOOR)
-    if not low <= Fraction(ends[0]) <= Fraction(ends[1]) <= high:
-        ends = f"{float(low)!r}", f"{float(high)!r}"
-    return f"[{ends[0]}, {ends[1]}]"
 
 
 def region(positions: Sequence[Quantity], box: Region) -> str:
     """Return a region of positions in words."""
     units = {p.name: p.unit for p in positions}
     parts = [
-        f"|{k}| ≤ {inward(b)} {units[k]}".rstrip() if a == -b
+        f"|{k}| ≤ {inward(b, 6)} {units[k]}".rstrip() if a == -b
         else f"{k} in {within(a, b)} {units[k]}".rstrip()
         for k, (a, b) in box.items()
         if a != 0 or b != 0
@@ -84,7 +55,7 @@ def sentence(claim: kernel.Claim, model: Model) -> str:
 def _(claim: kernel.Stability, model: Model) -> str:
     return (
         "motions on the surface near the target converge to it exponentially, at a rate of at "
-        f"least {inward(claim.rate)} 1/s; how near is not said, and the input is not limited"
+        f"least {inward(claim.rate, 6)} 1/s; how near is not said, and the input is not limited"
     )
 
 
@@ -93,19 +64,19 @@ def _(claim: kernel.Nonsingular, model: Model) -> str:
     where = region(model.positions, claim.region)
     return (
         f"the law exists {where}: M is positive definite, B and α_a − α_u M_uu⁻¹ M_auᵀ are "
-        f"non-singular, whose determinant keeps {inward(claim.ratio)} of that at the target"
+        f"non-singular, whose determinant keeps {inward(claim.ratio, 6)} of that at the target"
     )
 
 
 @sentence.register
 def _(claim: kernel.Reaching, model: Model) -> str:
     loads = ", ".join(
-        f"{p.name}: {inward(v)} {'N m' if p.unit == 'rad' else 'N'}"
+        f"{p.name}: {inward(v, 6)} {'N m' if p.unit == 'rad' else 'N'}"
         for p, v in zip(model.positions, claim.disturbance, strict=True)
         if v
     )
     what = f"overcomes every disturbance on {loads} at most," if loads else "reaches the surface"
-    rates = ", ".join(inward(v) for v in claim.rate)
+    rates = ", ".join(inward(v, 6) for v in claim.rate)
     return (
         f"the law {what} {region(model.positions, claim.region)}: (16) with η = {rates}, "
         "wherever |s_i| ≥ ε_i, the inputs not limited; motions that leave these positions are "
@@ -128,7 +99,7 @@ def _(claim: kernel.SurfaceRegion, model: Model) -> str:
     names = kernel.surface_names(model)
     away = {k: v for k, v in zip(names, claim.contains, strict=True) if v}
     exact = len(away) > 1  # with one entry the point may be rounded towards 0
-    points = [f"{k} = {float(v)!r}" if exact else f"{k} = {inward(v)}" for k, v in away.items()]
+    points = [f"{k} = {float(v)!r}" if exact else f"{k} = {inward(v, 6)}" for k, v in away.items()]
     ranges = "".join(f", for every {k} in {within(*ends)}" for k, ends in claim.plant.items())
     return (
         "every motion on the surface from a compact set around the target that contains "
@@ -141,11 +112,11 @@ def _(claim: kernel.SurfaceRegion, model: Model) -> str:
 def _(claim: kernel.ClosedLoop, model: Model) -> str:
     rates = [Quantity(f"{p.name}_dot", f"{p.unit}/s") for p in model.positions]
     starts = region([*model.positions, *rates], claim.starts).replace("for ", "with ", 1)
-    end = f"‖x‖ ≤ {inward(claim.ball)}" if claim.ball else "the target"
+    end = f"‖x‖ ≤ {inward(claim.ball, 6)}" if claim.ball else "the target"
     held = f"held for {float(claim.period)!r} s" if claim.period else "renewed at every instant"
     varied = ", ".join(f"{k} in {within(*ends)}" for k, ends in claim.plant.items())
     plant = f"any with {varied}" if varied else "the model"
-    loads = ", ".join(inward(v) for v in claim.disturbance)
+    loads = ", ".join(inward(v, 6) for v in claim.disturbance)
     return (
         f"every motion from starts {starts}, exists for ever and converges to {end}, the law "
         f"with its layer, its input clipped to {limits(model)} and {held}, the plant {plant}, "

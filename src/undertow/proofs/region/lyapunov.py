@@ -21,8 +21,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from undertow.base.arguments import require
 from undertow.models.mechanism import FloatArray
-from undertow.proofs.require import require
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
+from undertow.base.arguments import require
 from undertow.law import Surface, check_surface_shape
 from undertow.models.mechanism import FloatArray, Mechanism, Parameter
 from undertow.proofs.exact_model import (
@@ -18,7 +19,7 @@ from undertow.proofs.exact_model import (
     exact_mechanism,
     is_odd,
 )
-from undertow.proofs.require import require, require_autonomous
+from undertow.proofs.require import require_autonomous
 from undertow.symbolic import Tape, compile_numpy
 
 

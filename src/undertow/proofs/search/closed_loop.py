@@ -17,6 +17,7 @@ from functools import cached_property, partial
 import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
+from undertow.base.arguments import require
 from undertow.base.errors import InfeasibleError
 from undertow.base.verdict import Verdict
 from undertow.law import ReachingLaw, SlidingModeLaw, Surface
@@ -29,7 +30,6 @@ from undertow.proofs.kernel.claims import STEP
 from undertow.proofs.kernel.compiled import between
 from undertow.proofs.kernel.loop import MOST_OF_ONE, ContinuousLoop, HeldLoop, Loop, halves
 from undertow.proofs.kernel.model import Law, Model, scale_of, system
-from undertow.proofs.require import require
 from undertow.proofs.search.terminal_ellipsoid import EllipsoidSearch, search_for
 
 #: Motions that are simulated for the terminal set; the thinnest box of starts, of the reach.

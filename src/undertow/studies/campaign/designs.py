@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from undertow.base import InfeasibleError, InvalidInputError, ModelError
+from undertow.base import InfeasibleError, ModelError, require
 from undertow.cascade import Cascade, Run
 from undertow.closed_loop import ClosedLoop, Ensemble, Event, RolloutBuffers
 from undertow.law import Plan
@@ -33,9 +33,8 @@ class Designs(Study):
     def __init__(self, mechanism: Mechanism, settings: Settings) -> None:
         self.mechanism = mechanism
         self.axes = axes_of(settings, {p.name: p.unit for p in mechanism.parameters})
-        if not self.axes:
-            names = ", ".join(p.name for p in mechanism.parameters)
-            raise InvalidInputError(settings.what("axes"), value="none", limit=f"among {names}")
+        names = ", ".join(p.name for p in mechanism.parameters)
+        require(self.axes, settings.what("axes"), "none", f"among {names}")
         self.horizon = settings.number("horizon", 60.0, low=1e-3, high=1e4)
         self.plants = settings.count("plants", 64, high=10**5)
         self.spread = settings.number("spread", 0.2, low=0.0, high=0.9)

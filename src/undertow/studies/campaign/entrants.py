@@ -12,14 +12,18 @@ from typing import Any, Protocol
 import numpy as np
 
 from undertow.base import InvalidInputError, error_text
-from undertow.cascade import Cascade, CascadeState
+from undertow.cascade import Cascade
 from undertow.estimators import Estimator
 from undertow.law import first_surface
 from undertow.models import FloatArray, Mechanism
 from undertow.models.importers.python_file import in_a_file, named_in_file
 from undertow.objective import Objective
-from undertow.optimiser import Proposal
-from undertow.studies.trials.steering import CascadeSteering, clipped_regulator, keeping, predictive
+from undertow.studies.trials.steering import (
+    cascade_and_kept,
+    clipped_regulator,
+    keeping,
+    predictive,
+)
 from undertow.studies.trials.trial import MakeController, introduce
 
 #: Settings of a controller by name: what it is made with besides mechanism and objective.
@@ -134,22 +138,18 @@ class Feedback:
 
 
 @lru_cache(maxsize=4)
-def _started(
-    mechanism: Mechanism, objective: Objective
-) -> tuple[Cascade, tuple[CascadeState, Proposal]]:
-    cascade = Cascade(mechanism, objective)
-    return cascade, cascade.start(mechanism.usual_start)
+def _optimised(mechanism: Mechanism, objective: Objective) -> tuple[MakeController, MakeController]:
+    return cascade_and_kept(Cascade(mechanism, objective), mechanism.usual_start)
 
 
 def steered(mechanism: Mechanism, objective: Objective) -> Feedback:
     """Return the cascade as it is by default: ensemble, learning, gate, 10 decisions a second."""
-    return Feedback(lambda _: CascadeSteering(*_started(mechanism, objective)))
+    return Feedback(_optimised(mechanism, objective)[0])
 
 
 def kept(mechanism: Mechanism, objective: Objective) -> Feedback:
     """Return the cascade's first optimum, kept."""
-    cascade, (first, _) = _started(mechanism, objective)
-    return Feedback(keeping(mechanism, first.surface, cascade.reaching))
+    return Feedback(_optimised(mechanism, objective)[1])
 
 
 def designed(mechanism: Mechanism, objective: Objective) -> Feedback:

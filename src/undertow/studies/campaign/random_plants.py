@@ -8,14 +8,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from undertow.cascade import Cascade, CascadeState
+from undertow.cascade import Cascade
 from undertow.models import Mechanism
-from undertow.optimiser import Proposal
 from undertow.plants import Bench
 from undertow.plants.bench import bench_for
 from undertow.studies.campaign.definition import Settings, objective_of
 from undertow.studies.campaign.study import Arrays, Axis, Study, Variable, start_of, tolerances
-from undertow.studies.trials.steering import CascadeSteering, clipped_regulator, keeping
+from undertow.studies.trials.steering import cascade_and_kept, clipped_regulator
 from undertow.studies.trials.trial import MakeController, trial
 
 #: Contenders by the word for each.
@@ -72,18 +71,16 @@ class RandomPlants(Study):
         )
 
     @cached_property
-    def _first(self) -> tuple[Cascade, tuple[CascadeState, Proposal]]:
+    def _optimised(self) -> tuple[MakeController, MakeController]:
         cascade = Cascade(self.mechanism, self.objective, seed=self.seed)
-        return cascade, cascade.start(self.start)
+        return cascade_and_kept(cascade, self.start)
 
     def controller(self, name: str) -> MakeController:
         """Return what makes a contender for one trial."""
         if name == "lqr":
             return clipped_regulator(self.mechanism)
-        cascade, first = self._first
-        if name == "cascade":
-            return lambda _: CascadeSteering(cascade, first)
-        return keeping(self.mechanism, first[0].surface, cascade.reaching)
+        cascade, kept = self._optimised
+        return cascade if name == "cascade" else kept
 
     def compute(self, shard: int) -> Arrays:
         """Try every contender on the plants of a shard."""

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from undertow.base import InvalidInputError
+from undertow.base import InvalidInputError, require
 from undertow.closed_loop import ClosedLoop, Event
 from undertow.law import Surface, feedback_at_target, first_surface
 from undertow.models import FloatArray, Mechanism, fastest_rate, linearise
@@ -62,10 +62,7 @@ class RegionMap(Study):
         free = {k: v for k, v in state_units(mechanism).items() if k not in driven}
         self.axes = axes_of(settings, free)
         fixed = settings.table("at").by_name([k for k in free if k not in self._names])
-        if not self.axes:
-            raise InvalidInputError(
-                settings.what("axes"), value="none", limit=f"states among {', '.join(free)}"
-            )
+        require(self.axes, settings.what("axes"), "none", f"states among {', '.join(free)}")
         self.at = mechanism.state(**fixed)
         self.places = [names.index(axis.name) for axis in self.axes]
         self.most = settings.count("shard", 16384, high=1 << 20)

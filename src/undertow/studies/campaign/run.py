@@ -112,10 +112,7 @@ def compute(definition: Definition, shard: int) -> Arrays:
         For a number that the campaign does not have.
     """
     study = study_of(definition)
-    if not 0 <= shard < study.shards:
-        raise InvalidInputError(
-            "shard of the campaign", value=shard, limit=f"0 to {study.shards - 1}"
-        )
+    between("shard of the campaign", shard, 0, study.shards - 1)
     if study.threaded:
         return study.compute(shard)
     with _COMPUTING:  # searches remember their last answer: one at a time in each process

@@ -30,7 +30,14 @@ from types import FrameType
 
 import numpy as np
 
-from undertow.base import InvalidInputError, Progress, UndertowError, each, error_text, no_progress
+from undertow.base import (
+    Progress,
+    UndertowError,
+    each,
+    error_text,
+    no_progress,
+    require,
+)
 from undertow.cascade import CascadeState
 from undertow.models import FloatArray
 from undertow.plants import Measurement, Rig, RigWrapper
@@ -254,8 +261,7 @@ class Systematic:
         InvalidInputError
             For a rig that there is none of.
         """
-        if fault.rig not in RIGS:
-            raise InvalidInputError("rig of a fault", value=fault.rig, limit=" or ".join(RIGS))
+        require(fault.rig in RIGS, "rig of a fault", fault.rig, " or ".join(RIGS))
         tally, before = Tally(fault), _running()
         with tempfile.TemporaryDirectory() as folder:
             log = Path(folder) / "log.db"

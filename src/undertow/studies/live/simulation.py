@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import InvalidInputError, UndertowError, one_of
+from undertow.base import InvalidInputError, UndertowError, one_of, require
 from undertow.cascade import CascadeState
 from undertow.closed_loop.figures import display
 from undertow.display.live import Message, Scene
@@ -372,8 +372,8 @@ class Simulation:
         if not isinstance(reach, list) or len(reach) != 2:
             raise InvalidInputError("reach", value=repr(reach)[:80], limit="[far, fast], SI units")
         far, fast = (number_of("reach of the phase plane", one) for one in reach)
-        if not (0 < far < 1e6 and 0 < fast < 1e6):
-            raise InvalidInputError("reach", value=f"{far:g}, {fast:g}", limit="above 0, below 1e6")
+        near = 0 < far < 1e6 and 0 < fast < 1e6
+        require(near, "reach", f"{far:g}, {fast:g}", "above 0, below 1e6")
         self._look = int(number), (far, fast)
 
     # -- the slow loop ------------------------------------------------------------------------
@@ -671,6 +671,5 @@ def _place(value: object) -> FloatArray:
     if not isinstance(value, list) or len(value) != 2:
         raise InvalidInputError("place in the picture", value=repr(value)[:80], limit="[x, y], m")
     place = np.array([number_of("place in the picture", v) for v in value])
-    if not (np.abs(place) < 1e6).all():
-        raise InvalidInputError("place in the picture", value=place.tolist(), limit="near it")
+    require((np.abs(place) < 1e6).all(), "place in the picture", place.tolist(), "near it")
     return place

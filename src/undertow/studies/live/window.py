@@ -7,7 +7,6 @@ import os
 import time
 from multiprocessing.connection import Connection
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from undertow.base import ArtefactError, UndertowError, require_extra
@@ -77,10 +76,7 @@ class Window:
         """Return the window."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:  # fmt: skip
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Let it tell what came of the run, and end it."""
         self._line.close()
         if kind is None:

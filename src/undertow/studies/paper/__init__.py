@@ -10,7 +10,7 @@ from undertow.studies.paper.experiment import (
 from undertow.studies.paper.figures import figures
 from undertow.studies.paper.findings import Finding, findings
 from undertow.studies.paper.limits import catch_limit, singular_angle
-from undertow.studies.paper.tables import files, report, reproduce, reproduction
+from undertow.studies.paper.tables import files, report, reproduction
 
 __all__ = [
     "CASES",
@@ -29,7 +29,6 @@ __all__ = [
     "findings",
     "printed_motion",
     "report",
-    "reproduce",
     "reproduction",
     "singular_angle",
 ]

@@ -29,7 +29,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from undertow.base import InvalidInputError, Verdict, inward, require_extra
+from undertow.base import InvalidInputError, Verdict, inward, require, require_extra
 from undertow.base.verdict import Kind
 from undertow.law import Surface
 from undertow.models.mechanism import FloatArray, Mechanism
@@ -341,8 +341,7 @@ def two_vertex(reduced: Reduced, P: Lyapunov, half_width: float | Fraction) -> V
         the witness is an angle (and, within R, a direction) where it fails.
     """
     width = float(half_width)
-    if not width >= 0:
-        raise InvalidInputError("half-width of Ĩ", value=width, limit="≥ 0 rad")
+    require(width >= 0, "half-width of Ĩ", width, "≥ 0 rad")
     if Fraction(width) > half_width:
         width = math.nextafter(width, 0.0)
     claim = f"P ≻ 0 and R(y₁) ≻ 0 for |y₁| ≤ {inward(width, 6)} rad"

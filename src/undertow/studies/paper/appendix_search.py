@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from fractions import Fraction
 
 import numpy as np
-from numpy.typing import NDArray
 
 from undertow.base import InfeasibleError, require_extra
 from undertow.base.verdict import Verdict
+from undertow.models import FloatArray
 from undertow.studies.paper.appendix import (
     BITS,
     Lyapunov,
@@ -24,8 +24,6 @@ from undertow.studies.paper.appendix import (
     gamma_factor,
     two_vertex,
 )
-
-FloatArray = NDArray[np.float64]
 
 
 def _solve_sdp(

@@ -89,7 +89,8 @@ def _surface(alpha_u: float, lambda_u: float, lambda_a: float) -> Surface:
     return Surface(-1.0, lambda_a, alpha_u, lambda_u)
 
 
-_BASE = _surface(5, 10, -0.5)
+#: The base case of Tables 1 and 2.
+BASE = _surface(5, 10, -0.5)
 _ENERGY = (
     _surface(1.94, 11.14, -0.248),
     _surface(2.18, 13.37, -0.1),
@@ -106,10 +107,10 @@ _TIME = (
 #: (objective, row) to what Tables 1 (energy, V² s) and 2 (time, s) print.
 PRINTED: Mapping[tuple[str, str], Printed] = MappingProxyType(
     {
-        ("energy", "base"): Printed((_BASE,), 44.7),
+        ("energy", "base"): Printed((BASE,), 44.7),
         ("energy", "one-time"): Printed(_ENERGY[:1], 17.6),
         ("energy", "cascade"): Printed(_ENERGY, 15.7),
-        ("time", "base"): Printed((_BASE,), 16.2),
+        ("time", "base"): Printed((BASE,), 16.2),
         ("time", "one-time"): Printed(_TIME[:1], 2.8),
         ("time", "cascade"): Printed(_TIME, 2.0),
     }
@@ -118,7 +119,7 @@ PRINTED: Mapping[tuple[str, str], Printed] = MappingProxyType(
 #: The appendix's five cases: a name to the surface.
 CASES: Mapping[str, Surface] = MappingProxyType(
     {
-        "1 base case": _BASE,
+        "1 base case": BASE,
         "2 one-time, energy": _ENERGY[0],
         "3 last of cascade, energy": _ENERGY[3],
         "4 one-time, time": _TIME[0],

@@ -287,8 +287,3 @@ def reproduction(*, seed: int = 0, effort: Effort = FULL) -> Experiment[Any, Rep
         gather=partial(gathered, seed, effort),
         whole=True,
     )
-
-
-def reproduce(*, seed: int = 0, effort: Effort = FULL) -> Reproduction:
-    """Run the whole experiment, see :func:`reproduction`."""
-    return reproduction(seed=seed, effort=effort).run()

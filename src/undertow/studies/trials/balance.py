@@ -16,23 +16,18 @@ from itertools import product
 
 from undertow.base import InfeasibleError
 from undertow.cascade import Cascade
-from undertow.law import Surface
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import Goal, Objective, objective_for
 from undertow.optimiser import Budget
 from undertow.plants import Bench, srv02_rig
 from undertow.runtime import estimator_for, for_rig
 from undertow.studies.ledger import Key
-from undertow.studies.trials.steering import CascadeSteering, keeping
+from undertow.studies.paper.data import BASE, ROWS
+from undertow.studies.trials.steering import cascade_and_kept, keeping
 from undertow.studies.trials.trial import MakeController, Outcome, Result, trial
-
-#: The base case of Tables 1 and 2.
-BASE = Surface(alpha_a=-1, lambda_a=-0.5, alpha_u=5, lambda_u=10)
 
 #: The two objectives of the paper, as they suit a bench.
 GOALS: tuple[Goal, ...] = ("bench-energy", "bench-time")
-
-ROWS = ("base", "one-time", "cascade")
 
 #: Stands for the ideal rig among seeds; for the searches for catch limits among objectives.
 IDEAL, LIMIT = -1, "catch limit"
@@ -56,15 +51,8 @@ def controllers(
     estimator does.
     """
     exact = Cascade(belief, objective, warm=Budget(budget))
-    cascade = for_rig(exact, estimator_for(belief, bench))
-    start = cascade.start(x0)
-    once = start[1].surface
-    assert once is not None  # start() raises otherwise
-    return {
-        "base": keeping(belief, BASE),
-        "one-time": keeping(belief, once),
-        "cascade": lambda _: CascadeSteering(cascade, start),
-    }
+    cascade, once = cascade_and_kept(for_rig(exact, estimator_for(belief, bench)), x0)
+    return {"base": keeping(belief, BASE), "one-time": once, "cascade": cascade}
 
 
 @lru_cache(maxsize=2)

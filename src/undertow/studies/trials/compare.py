@@ -10,12 +10,12 @@ from typing import Any, TypeVar
 import numpy as np
 
 from undertow.base import (
-    InvalidInputError,
     as_text,
     at_least,
     checked,
     number,
     positive,
+    require,
     require_extra,
     table,
 )
@@ -27,7 +27,12 @@ from undertow.objective import Objective
 from undertow.plants import Bench
 from undertow.plants.bench import bench_for
 from undertow.runtime import estimator_for
-from undertow.studies.trials.steering import CascadeSteering, clipped_regulator, keeping, predictive
+from undertow.studies.trials.steering import (
+    cascade_and_kept,
+    clipped_regulator,
+    keeping,
+    predictive,
+)
 from undertow.studies.trials.trial import MakeController, Outcome, trial
 
 #: What :func:`compare` takes for a controller.
@@ -181,8 +186,7 @@ def compare(
     InvalidInputError
         When there is nothing to compare.
     """
-    if not controllers:
-        raise InvalidInputError("controllers to compare", value="none", limit="at least one")
+    require(controllers, "controllers to compare", "none", "at least one")
     positive("length of a trial, s", seconds)
     at_least("seed", seed, 0)
     start = mechanism.initial_state(x0, state)
@@ -218,8 +222,7 @@ def _maker(
 ) -> MakeController:
     """Return what makes the controller of one run."""
     if isinstance(controller, Cascade):
-        first = controller.start(start)
-        return lambda _: CascadeSteering(controller, first)
+        return cascade_and_kept(controller, start)[0]
     if isinstance(controller, Surface):
         return keeping(mechanism, controller)
     return controller

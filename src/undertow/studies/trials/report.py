@@ -21,7 +21,8 @@ from undertow.objective import Goal, objective_for
 from undertow.plants import Bench, srv02_rig
 from undertow.runtime import Recipe, default_gate, estimator_for
 from undertow.studies.figures import REPEATS, ROW_LINES, beginning, rows_figure
-from undertow.studies.trials.balance import GOALS, IDEAL, LIMIT, ROWS, Balance
+from undertow.studies.paper.data import ROWS
+from undertow.studies.trials.balance import GOALS, IDEAL, LIMIT, Balance
 from undertow.studies.trials.estimation import EstimatorRow
 from undertow.studies.trials.library import LibraryRow
 from undertow.studies.trials.robustness import FACTORS, RANDOM, SEEDS, SINGLE

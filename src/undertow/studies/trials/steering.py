@@ -128,6 +128,19 @@ class CascadeSteering:
         self.waiting = self.cascade.propose(self.memory, ahead, later)
 
 
+def cascade_and_kept(cascade: Cascade, x0: FloatArray) -> tuple[MakeController, MakeController]:
+    """Return the makers of the cascade and of its first optimum, kept: one search from x0, (2n,).
+
+    Raises
+    ------
+    InfeasibleError
+        When the first optimisation finds no admissible surface.
+    """
+    start = cascade.start(x0)
+    kept = keeping(cascade.mechanism, start[0].surface, cascade.reaching)
+    return lambda _: CascadeSteering(cascade, start), kept
+
+
 class NMPC:
     """The optimal-control problem of one mechanism, warm-started from solution to solution.
 

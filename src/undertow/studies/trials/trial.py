@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from undertow.estimators import Belief, Estimator, Record, StateFeedback, compensated, run_recorded
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import Objective
-from undertow.plants import Bench, RealisticRig
+from undertow.plants import Bench, RealisticRig, Rig
 from undertow.runtime import estimator_for
 
 #: Belief and estimated start, (2n,), to a controller for one run.
@@ -99,16 +99,28 @@ def trial(
     taken off the output in each step in which ``compensates`` says so. ``home`` is as for
     :func:`judge`.
     """
-    rig = RealisticRig(bench, x0, seed)
-    seen = np.concatenate([rig.read().q, np.zeros(belief.n)])
     if estimator is None:
         estimator = estimator_for(belief, told or bench, known=Belief.usual(belief))
+    rig = RealisticRig(bench, x0, seed)
+    record = run_trial(belief, rig, estimator, make, seconds, compensates)
+    return judge(belief, record, seed, objective, home)
+
+
+def run_trial(
+    belief: Mechanism,
+    rig: Rig,
+    estimator: Estimator,
+    make: MakeController,
+    seconds: float,
+    compensates: Callable[[], bool] = lambda: True,
+) -> Record:
+    """Run a controller on any rig that stands at its start, see :func:`trial`."""
+    seen = np.concatenate([rig.read().q, np.zeros(belief.n)])
     estimator.reset(seen)
     steering = make(seen)
     introduce(steering, estimator)
     controller = compensated(steering, estimator, belief.input_limits, compensates)
-    record = run_recorded(rig, estimator, controller, seconds)
-    return judge(belief, record, seed, objective, home)
+    return run_recorded(rig, estimator, controller, seconds)
 
 
 def judge(

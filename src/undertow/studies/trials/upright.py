@@ -11,7 +11,7 @@ import numpy as np
 from undertow.cascade import Cascade
 from undertow.cascade.swing_up import CatchRegion, SwingUp, SwingUpAndCatch, hanging
 from undertow.cascade.swing_up.search import RatedGains, designs_for
-from undertow.estimators import Estimator, compensated, run_recorded
+from undertow.estimators import Estimator
 from undertow.mechanisms import LIBRARY
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import objective_for
@@ -20,7 +20,7 @@ from undertow.plants import Bench, MuJoCoRig
 from undertow.plants.bench import bench_for
 from undertow.runtime import default_gate, estimator_for
 from undertow.studies.trials.steering import CascadeSteering
-from undertow.studies.trials.trial import Outcome, Result, judge, trial
+from undertow.studies.trials.trial import Outcome, Result, judge, run_trial, trial
 
 #: Length of a swing-up run, s.
 SWING_SECONDS = 30.0
@@ -157,9 +157,7 @@ def engine_trial(name: str, *, seconds: float = 10.0, budget: int = 256) -> Engi
         mechanism, objective, gate=default_gate(kalman), warm=Budget(budget), belief="exact"
     )
     steering = CascadeSteering(cascade, cascade.start(x0))
-    kalman.reset(x0)
-    controller = compensated(steering, kalman, mechanism.input_limits)
-    record = run_recorded(rig, kalman, controller, seconds)
+    record = run_trial(mechanism, rig, kalman, lambda _: steering, seconds)
     outcome = judge(mechanism, record, 0, objective)
     final = record.truth[-1, : mechanism.n]
     return EngineResult(mechanism.name, outcome.numbers, final, steering.admitted)
