@@ -535,6 +535,7 @@ def test_running_cost_that_counts_rest_frees_the_final_time() -> None:
     assert fastest.cost < found.cost < fastest.cost * (1 + 0.01 * 15.0**2)
 
 
+@pytest.mark.slow
 def test_disturbance_that_depends_on_time_is_met() -> None:
     """A plant with an explicit t in its forces: the motion is one of that plant."""
     plant = linear_plant(5.0).disturbed({"b": sp.sin(3 * ut.models.mechanism.TIME)})

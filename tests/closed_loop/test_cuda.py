@@ -48,7 +48,9 @@ def agree(
     "loop",
     [
         pytest.param(ClosedLoop(RIG, ut.MinimumTime(horizon=2.0)), marks=pytest.mark.slow),
-        ClosedLoop(RIG, ut.MinimumEnergy(horizon=2.0), zoh_steps=2),  # others have its kernel
+        pytest.param(
+            ClosedLoop(RIG, ut.MinimumEnergy(horizon=2.0), zoh_steps=2), marks=pytest.mark.slow
+        ),
         pytest.param(
             ClosedLoop(
                 RIG,

@@ -289,6 +289,7 @@ print(hashlib.sha256(kernel_source(program, sampled=False, header="").encode()).
 """
 
 
+@pytest.mark.slow
 def test_source_does_not_depend_on_the_order_of_hashing() -> None:
     """Another process, with another hash seed, writes the same file: its kernel is cached."""
     environment = os.environ | {"PYTHONHASHSEED": "1"}

@@ -271,6 +271,7 @@ def _off_by_counts(
     return float(off @ learnt.information @ off) / len(off), float(np.abs(off).max())
 
 
+@pytest.mark.slow
 def test_counts_teach_no_more_than_they_say() -> None:
     """A slow pendulum stays within a count for tens of readings, which all have the same error.
 

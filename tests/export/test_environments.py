@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import undertow as ut
+from support import rest_slow
 from undertow.base import InvalidInputError, MissingExtraError
 from undertow.mechanisms import LIBRARY
 
@@ -98,7 +99,7 @@ def test_a_fast_mode_is_followed_too(damping: float) -> None:
         np.testing.assert_allclose(-reward, z[-1], rtol=1e-3)
 
 
-@pytest.mark.parametrize("name", ["rotary_pendulum", "cart_pendulum"])
+@pytest.mark.parametrize("name", rest_slow(["rotary_pendulum", "cart_pendulum"], "cart_pendulum"))
 def test_each_of_many_is_as_it_would_be_alone(name: str) -> None:
     """Gymnasium's own vector of single ones, over ends and new beginnings, to the last bit."""
     count, made = 5, {"objective": "time", "period": 0.02}

@@ -107,7 +107,7 @@ def gcc(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize(
     ("name", "real", "differentiator"),
     [
-        ("rotary_pendulum", "double", DerivativeStep()),
+        pytest.param("rotary_pendulum", "double", DerivativeStep(), marks=pytest.mark.slow),
         ("rotary_pendulum", "float", SuperTwistingStep()),
         (M, "double", SuperTwistingStep((300.0, 200.0, 100.0))),
         pytest.param(M, "float", DerivativeStep(0.004), marks=pytest.mark.slow),

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import undertow as ut
+from support import rest_slow
 from undertow.base import InvalidInputError, MissingExtraError, UnstableSurfaceError
 from undertow.cascade.robustness import delay_margin
 from undertow.closed_loop import Event
@@ -69,7 +70,10 @@ def test_a_disturbance_enters_behind_the_actuator() -> None:
     np.testing.assert_allclose(rate[2:], RIG.accelerations(0.0, x, u + 2.0), rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["rotary_pendulum", "two_motor_three_link", "cart_pendulum"])
+@pytest.mark.parametrize(
+    "name",
+    rest_slow(["rotary_pendulum", "two_motor_three_link", "cart_pendulum"], "rotary_pendulum"),
+)
 def test_what_is_within_the_margins_is_stable_and_what_is_beyond_is_not(name: str) -> None:
     """Each margin by itself, on the loop that it was computed from; delays by Nyquist's count."""
     mechanism = getattr(ut.mechanisms, name)()

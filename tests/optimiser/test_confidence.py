@@ -89,13 +89,19 @@ def test_a_cold_search_says_it_and_a_warm_one_does_not() -> None:
     assert 0.0 <= cold.confidence <= 1.0
     assert f"confidence {cold.confidence:.0%}" in repr(cold)
     assert pickle.loads(pickle.dumps(cold)).confidence == cold.confidence
-    again = optimiser.propose(x0)
-    assert (again.confidence, again.cost) == (cold.confidence, cold.cost)
     warm = optimiser.propose(x0, incumbent=cold.plan)
     assert warm.confidence is None
     assert "confidence" not in repr(warm)
     short = optimiser.propose(x0, budget=Budget(3072))
     assert short.confidence is None
+
+
+@pytest.mark.slow
+def test_the_same_search_says_the_same() -> None:
+    rig = ut.mechanisms.rotary_pendulum(d_e=0.025)
+    optimiser = ut.Cascade(rig, ut.MinimumEnergy(), belief="exact").optimiser
+    once, again = (optimiser.propose(rig.state(phi=ut.deg(30))) for _ in range(2))
+    assert (again.confidence, again.cost) == (once.confidence, once.cost)
 
 
 def test_where_nothing_is_found_nothing_is_said() -> None:

@@ -503,6 +503,7 @@ def test_kept_starts_come_home_with_every_plant_of_a_box(
         assert found.details["tubes"] < 8
 
 
+@pytest.mark.slow
 def test_neighbours_of_kept_claims_that_are_false_are_not_proved() -> None:
     """Starts and plants that fall by simulation, next to those that are proved."""
     by_mass, by_both = kept("held_loop_plants_v2.json")

@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 import undertow as ut
 from mechanism_motions import COARSER, STEP, Claimed, claims
+from support import rest_slow
 from undertow.law import ReachingLaw, SlidingModeLaw
 from undertow.models import FloatArray
 from undertow.proofs import read_certificate, verify
@@ -124,7 +125,7 @@ def test_steps_are_fine_enough(name: str) -> None:
         assert x[0] == pytest.approx(end, rel=1e-3, abs=1e-3 * np.abs(end).max())
 
 
-@pytest.mark.parametrize("name", ["tora", "ball_and_beam"])
+@pytest.mark.parametrize("name", rest_slow(["tora", "ball_and_beam"], "tora"))
 def test_motions_from_the_edges_of_quick_claims_come_home(name: str) -> None:
     for claim in kept(name):
         assert claim.tried(np.random.default_rng(1), 40) == 0

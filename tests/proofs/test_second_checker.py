@@ -377,7 +377,7 @@ def mutant(source: random.Random) -> Document:
 
 @needs_compiler
 @pytest.mark.parametrize(
-    ("seed", "documents"), [(16, 60), pytest.param(1, 300, marks=pytest.mark.slow)]
+    ("seed", "documents"), [(16, 20), pytest.param(1, 300, marks=pytest.mark.slow)]
 )
 def test_mutants_are_decided_alike_and_nothing_false_is_proved(
     program: Path, tmp_path: Path, seed: int, documents: int
