@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -290,6 +293,20 @@ def test_changed_numbers_make_a_new_mechanism_and_leave_the_old_one() -> None:
     assert heavier.with_parameters(m=0.125).fingerprint == rig.fingerprint
     assert rig.with_input_limit(3.0).input_limits == [3.0]
     assert rig.with_disturbance_bounds(0.1, 0.2).disturbance_bounds == (0.1, 0.2)
+
+
+def test_nobody_moves_the_start_of_a_mechanism_that_is_there() -> None:
+    """A controller in a league has the mechanism that all the others are judged with."""
+    start = {"theta": 0.2}
+    crane = replace(ut.mechanisms.overhead_crane(), start=start)
+    start["theta"] = 0.1
+    with pytest.raises(TypeError, match="item assignment"):
+        crane.start["theta"] = 0.0  # type: ignore[index]
+    again = pickle.loads(pickle.dumps(crane))
+    with pytest.raises(TypeError, match="item assignment"):
+        again.start["theta"] = 0.0
+    for one in (crane, again, copy.deepcopy(crane), crane.with_parameters(l=0.5)):
+        assert one.start == {"theta": 0.2}
 
 
 def test_states_are_set_by_name_and_functions_broadcast() -> None:

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
@@ -99,7 +100,7 @@ class Mechanism:
     potential
         Potential energy, J, where there is one (used by the energy balance).
     start
-        A usual initial state, by names, for examples and the command line.
+        A usual initial state, by names, for examples and the command line: a copy is kept.
     description, source
         In words, and where the model comes from.
 
@@ -199,6 +200,15 @@ class Mechanism:
         self._check()
         by_names(f"start of '{self.name}'", self.start)
         self.state(**self.start)
+        object.__setattr__(self, "start", MappingProxyType(dict(self.start)))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Give the start as a dict: a view of one cannot be pickled."""
+        return vars(self) | {"start": dict(self.start)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take it back as a view that nobody can write to."""
+        self.__dict__.update(state, start=MappingProxyType(state["start"]))
 
     def _check(self) -> None:
         data = vocabulary(parameters=self.parameters, time=False)
