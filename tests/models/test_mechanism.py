@@ -309,6 +309,21 @@ def test_nobody_moves_the_start_of_a_mechanism_that_is_there() -> None:
         assert one.start == {"theta": 0.2}
 
 
+def test_columns_with_names_are_found_by_their_names() -> None:
+    """A row of a table knows which state is which; in its own order it is another state."""
+    pandas = pytest.importorskip("pandas")
+    crane = ut.mechanisms.overhead_crane()
+    frame = pandas.DataFrame(
+        {"theta": [0.1, 0.2], "x": [0.3, 0.4], "cost": 9.0, "theta_dot": 0.5, "x_dot": 0.6}
+    )
+    x = np.array([[0.3, 0.1, 0.6, 0.5], [0.4, 0.2, 0.6, 0.5]])
+    assert (crane.check_state(frame) == x).all()
+    assert (crane.f(frame.iloc[1]) == crane.f(x[1])).all()
+    assert (crane.check_state(pandas.Series(x[0])) == x[0]).all()
+    with pytest.raises(InvalidInputError, match=r"got theta, x, must be x, theta, x_dot"):
+        crane.check_state(frame[["theta", "x"]])
+
+
 def test_states_are_set_by_name_and_functions_broadcast() -> None:
     rig = ut.mechanisms.rotary_pendulum()
     np.testing.assert_array_equal(rig.state(phi=0.2, theta_dot=-1), [0, 0.2, -1, 0])

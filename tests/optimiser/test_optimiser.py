@@ -65,10 +65,13 @@ def test_never_worse_than_the_incumbent(
 def test_a_least_time_is_found_in_any_unit(rig: ut.Mechanism) -> None:
     """Milliseconds, or a price of time: the search is the same, bit for bit, and the answer's unit
     that of the objective.  It takes costs for times where nothing but time costs."""
+
+    def priced(price: float) -> ut.Objective:
+        return ut.Objective("time", lambda _: price, horizon=5.0)
+
     x, answers = rig.state(phi=ut.deg(20)), []
-    for price in (1, 1000, 1e-6):
-        objective = ut.Objective("time", lambda _, price=price: price, horizon=5.0)
-        loop = ut.ClosedLoop(rig, objective, tail_rtol=5e-3)
+    for price in (1.0, 1000.0, 1e-6):
+        loop = ut.ClosedLoop(rig, priced(price), tail_rtol=5e-3)
         optimiser = ut.Optimiser(loop, cold=ut.Budget(512), warm=ut.Budget(96))
         first = optimiser.propose(x)
         assert first.plan is not None

@@ -655,6 +655,8 @@ class Mechanism:
     def check_state(self, x: ArrayLike) -> FloatArray:
         """Return ``x`` as a float array (…, 2n), refusing wrong lengths and NaN.
 
+        Where its columns have names, as pandas has them, they are found by name, in any order.
+
         Raises
         ------
         InvalidInputError
@@ -674,8 +676,18 @@ class Mechanism:
     def _columns(
         self, what: str, values: ArrayLike, names: Sequence[str], remedy: str = ""
     ) -> FloatArray:
-        """Return values as floats, (…, len(names)), or refuse them."""
+        """Return values, by their names where they have some, as floats (…, len(names))."""
         what = f"{what} of '{self.name}'"
+        labels = [] if isinstance(values, Mapping) else list(getattr(values, "keys", tuple)())
+        if labels and all(isinstance(label, str) for label in labels):
+            if not set(names) <= set(labels):
+                raise InvalidInputError(
+                    f"names of the {what}",
+                    value=", ".join(labels),
+                    limit=", ".join(names),
+                    remedy="Give all of them, in any order, or numbers without names",
+                )
+            values = cast(Any, values)[list(names)]
         array = floats(what, values)
         if array.ndim == 0 or array.shape[-1] != len(names):
             raise InvalidInputError(
