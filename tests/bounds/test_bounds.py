@@ -221,6 +221,23 @@ def test_cost_converges_with_the_order_of_a_piecewise_linear_input() -> None:
     assert order == pytest.approx(4.0, abs=0.5)
 
 
+@pytest.mark.parametrize("price", [1e-6, 1e6])
+def test_a_bound_is_the_same_in_any_unit_of_cost(price: float) -> None:
+    """IPOPT's tolerances are absolute: effort in MN² is as well resolved as in N², and says so."""
+
+    def effort(factor: float) -> ut.Objective:
+        return ut.Objective("effort", lambda v: factor * v.inputs[0] ** 2)
+
+    plant, x0 = linear_plant(), np.array([1.0, -0.5, 0.2, 0.3])
+    start = Guess("rest", 4.0, lambda t: np.zeros((len(t), 4)), lambda t: np.zeros((len(t), 1)))
+    mesh, found = np.linspace(0, 1, 17), []
+    for factor in (1.0, price):
+        programme = Programme(ca, plant, effort(factor), x0, 4.0)
+        found.append(programme.solve(mesh, start, programme.cost, fixed=4.0))
+    assert found[1].cost / price == pytest.approx(found[0].cost, rel=1e-6)
+    assert found[1].stationarity < 1e-6
+
+
 def test_double_integrator_takes_twice_the_root_of_distance_over_limit() -> None:
     """Minimum time of ẍ = u, |u| ≤ U from rest at d is 2√(d/U), bang-bang.
 

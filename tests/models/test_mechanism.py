@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -290,6 +293,35 @@ def test_changed_numbers_make_a_new_mechanism_and_leave_the_old_one() -> None:
     assert heavier.with_parameters(m=0.125).fingerprint == rig.fingerprint
     assert rig.with_input_limit(3.0).input_limits == [3.0]
     assert rig.with_disturbance_bounds(0.1, 0.2).disturbance_bounds == (0.1, 0.2)
+
+
+def test_nobody_moves_the_start_of_a_mechanism_that_is_there() -> None:
+    """A controller in a league has the mechanism that all the others are judged with."""
+    start = {"theta": 0.2}
+    crane = replace(ut.mechanisms.overhead_crane(), start=start)
+    start["theta"] = 0.1
+    with pytest.raises(TypeError, match="item assignment"):
+        crane.start["theta"] = 0.0  # type: ignore[index]
+    again = pickle.loads(pickle.dumps(crane))
+    with pytest.raises(TypeError, match="item assignment"):
+        again.start["theta"] = 0.0
+    for one in (crane, again, copy.deepcopy(crane), crane.with_parameters(l=0.5)):
+        assert one.start == {"theta": 0.2}
+
+
+def test_columns_with_names_are_found_by_their_names() -> None:
+    """A row of a table knows which state is which; in its own order it is another state."""
+    pandas = pytest.importorskip("pandas")
+    crane = ut.mechanisms.overhead_crane()
+    frame = pandas.DataFrame(
+        {"theta": [0.1, 0.2], "x": [0.3, 0.4], "cost": 9.0, "theta_dot": 0.5, "x_dot": 0.6}
+    )
+    x = np.array([[0.3, 0.1, 0.6, 0.5], [0.4, 0.2, 0.6, 0.5]])
+    assert (crane.check_state(frame) == x).all()
+    assert (crane.f(frame.iloc[1]) == crane.f(x[1])).all()
+    assert (crane.check_state(pandas.Series(x[0])) == x[0]).all()
+    with pytest.raises(InvalidInputError, match=r"got theta, x, must be x, theta, x_dot"):
+        crane.check_state(frame[["theta", "x"]])
 
 
 def test_states_are_set_by_name_and_functions_broadcast() -> None:

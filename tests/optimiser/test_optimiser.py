@@ -62,6 +62,30 @@ def test_never_worse_than_the_incumbent(
         )
 
 
+def test_a_least_time_is_found_in_any_unit(rig: ut.Mechanism) -> None:
+    """Milliseconds, or a price of time: the search is the same, bit for bit, and the answer's unit
+    that of the objective.  It takes costs for times where nothing but time costs."""
+
+    def priced(price: float) -> ut.Objective:
+        return ut.Objective("time", lambda _: price, horizon=5.0)
+
+    x, answers = rig.state(phi=ut.deg(20)), []
+    for price in (1.0, 1000.0, 1e-6):
+        loop = ut.ClosedLoop(rig, priced(price), tail_rtol=5e-3)
+        optimiser = ut.Optimiser(loop, cold=ut.Budget(512), warm=ut.Budget(96))
+        first = optimiser.propose(x)
+        assert first.plan is not None
+        next_ = optimiser.propose(0.9 * x, incumbent=first.plan, sequence=1, promised=first.cost)
+        assert next_.plan is not None
+        assert next_.incumbent_cost >= next_.cost
+        answers.append((first.plan, next_.plan, first.cost / price, next_.cost / price))
+    for found in answers[1:]:
+        assert [p.vectors.tolist() for p in found[:2]] == [
+            p.vectors.tolist() for p in answers[0][:2]
+        ]
+        assert found[2:] == pytest.approx(answers[0][2:], rel=1e-12)
+
+
 @pytest.mark.parametrize(
     ("name", "degrees", "radius"),
     [("time", 23, 0.3), pytest.param("energy", 20, 0.01, marks=pytest.mark.slow)],

@@ -359,12 +359,15 @@ with executor_for() as (pool, width):
 def test_a_changed_definition_is_refused(serial: Path) -> None:
     before = content(serial)
     with executor_for() as (pool, _):
-        for other in (
-            Definition.of(RIG, **REGION | {"horizon": 9.0}),
-            Definition.of(RIG, **REGION, parameters={"m": 0.13}),
-            Definition.of("cart_pendulum", **REGION),
+        for other, what in (
+            (Definition.of(RIG, **REGION | {"horizon": 9.0}), "another definition,"),
+            (
+                Definition.of(RIG, **REGION, parameters={"m": 0.13}),
+                "another definition and another mechanism,",
+            ),
+            (Definition.of("cart_pendulum", **REGION), "another mechanism,"),
         ):
-            with pytest.raises(ArtefactError, match=r"another campaign.*--out"):
+            with pytest.raises(ArtefactError, match=rf"another campaign.*{what}.*--out"):
                 Campaign(other, serial).run(pool, resume=True)
         with pytest.raises(ArtefactError, match=r"there is one.*--resume"):
             Campaign(MAP, serial).run(pool)

@@ -196,8 +196,13 @@ def test_threads_and_serial_give_the_same_bits_and_a_changed_file_is_another_lea
         assert same or variable.measured
     mine.write_text(OTHERS + "\n# changed\n", encoding="utf-8")
     changed = Definition(definition.mechanism, definition.text + " ", definition.code)
-    with executor_for() as (pool, _), pytest.raises(ArtefactError, match="another campaign"):
-        Campaign(changed, tmp_path / "1.zarr").run(pool, resume=True)
+    alone = Definition(definition.mechanism, definition.text)
+    for other, what in ((changed, "version of an entrant's file,"), (alone, "--entrant,")):
+        with (
+            executor_for() as (pool, _),
+            pytest.raises(ArtefactError, match=f"another campaign.*another {what}.*--mechanism"),
+        ):
+            Campaign(other, tmp_path / "1.zarr").run(pool, resume=True)
 
 
 @pytest.mark.slow

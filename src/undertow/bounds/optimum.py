@@ -58,7 +58,8 @@ class Bound:
     violation
         Largest violation of any constraint of the programme.
     stationarity
-        Largest entry of the gradient of the Lagrangian, over max(1, max |∇ cost|).
+        Largest entry of the gradient of the Lagrangian, over max |∇ cost|, or over 1 or a
+        cheap motion's cost where that is more.
     change
         Relative change in cost at the last mesh refinement: an estimate of the
         discretisation error.
@@ -201,7 +202,6 @@ def bound(
         return _bound(mechanism, _at_target(mechanism, start), began)
     casadi = require_extra("casadi", "bounds", "optimal-control bounds need CasADi")
     programme = Programme(casadi, mechanism, objective, start, longest)
-    programme.unit = min([1.0, *(c for c in map(programme.spent, given) if c > 0)])
     candidates: list[Solution] = []
     failures: list[str] = []
     iterations = 0

@@ -28,6 +28,9 @@ SETTLED = 5e-4
 REFINEMENTS = 6
 GROWTH = 1.4
 
+#: Where a least cost is this part of the unit of the tolerances, it is the unit from then on.
+CHEAP = 0.1
+
 #: IPOPT's iterations per solve.  Problems that have a solution need 15 to 60, few 150.
 ITERATIONS = 200
 
@@ -133,7 +136,7 @@ class Programme:
         ):
             require_smooth(what, expressions, (*mechanism.x, *mechanism.u))
         self.cost = dynamics(ca, mechanism, stage, margins)
-        #: The cost that IPOPT's tolerances, which are absolute, take for one.
+        #: The cost that IPOPT's tolerances, which are absolute, take for one: at most 1.
         self.unit = 1.0
         self.effort = dynamics(ca, mechanism, sp.sympify(effort) / mechanism.m, margins)
         self._held: list[float] = []  # costs of motions until the horizon, each released once
@@ -183,7 +186,8 @@ class Programme:
 
         Where rest costs something near is anywhere up to the horizon: shorter is always better.
         Where it costs nothing the cost is flat in a time that is too long, and the search for the
-        time must not leave the valley that the guess lies in.
+        time must not leave the valley that the guess lies in.  What is far cheaper than the unit of
+        the tolerances is solved again in its own: the optimum must not depend on the cost's unit.
         """
         ca, n, m, count = self.ca, 2 * self.mechanism.n, self.mechanism.m, len(mesh) - 1
         written = self._transcribe(mesh, dynamics)
@@ -229,18 +233,22 @@ class Programme:
         nodes, centres, controls, last = np.split(
             solution, np.cumsum([n * (count + 1), n * count, m * (count + 1)])
         )
-        u = controls.reshape(-1, m)
+        u, cost, iterations = controls.reshape(-1, m), float(found["f"]), statistics["iter_count"]
+        if dynamics is self.cost and report in _STATUS and 0 < cost < CHEAP * self.unit:
+            self.unit = cost
+            again = self.solve(mesh, guess, dynamics, fixed=fixed, patience=patience)
+            return replace(again, iterations=again.iterations + iterations)
         return Solution(
             name=guess.name,
             status=_STATUS.get(report),
             message=report.replace("_", " ").lower(),
-            cost=float(found["f"]),
+            cost=cost,
             times=_weave(mesh, middles) * float(last[0]),
             x=_weave(nodes.reshape(-1, n), centres.reshape(-1, n)),
             u=_weave(u, (u[:-1] + u[1:]) / 2),
             violation=max(0.0, *(float(b) for b in broken)),
             stationarity=self._stationarity(written, constraints, found),
-            iterations=int(statistics["iter_count"]),
+            iterations=int(iterations),
         )
 
     def _stationarity(self, written: _Transcription, constraints: Any, found: Any) -> float:
@@ -255,14 +263,7 @@ class Programme:
         )
         slope, steepness = gradients(found["x"], found["lam_g"])
         largest = np.abs(np.array(slope + found["lam_x"])).max()
-        return float(largest / max(1.0, np.abs(np.array(steepness)).max()))
-
-    def spent(self, guess: Guess) -> float:
-        """Return the cost of a guess as it stands, by the trapezoidal rule."""
-        samples = 400
-        t = np.linspace(0.0, guess.time, samples)
-        rows = (t[None], guess.x(t).T, guess.u(t).T)
-        return float(np.trapezoid(np.array(self.cost.map(samples)(*rows)[1]).ravel(), t))
+        return float(largest / max(self.unit, np.abs(np.array(steepness)).max()))
 
     def first(self, guess: Guess, count: int) -> Solution:
         """Solve on the first mesh.
@@ -357,7 +358,7 @@ class Programme:
             solution = replace(
                 finer,
                 defect=float(errors.max()),
-                change=abs(finer.cost - solution.cost) / max(abs(finer.cost), 1e-12),
+                change=abs(finer.cost - solution.cost) / (abs(finer.cost) or 1.0),
             )
             if solution.defect <= DEFECT and solution.change <= SETTLED:
                 break

@@ -260,7 +260,7 @@ class Cascade:
             self.known is not None
             and self.planner is None
             and (self.freedom.schedule > 0 or self.covariance is None)
-            and self.loop.counts_time
+            and self.loop.price_of_time > 0
         )
 
     # -- what it is made of -----------------------------------------------------------------

@@ -173,7 +173,8 @@ def next_plan(
             optimiser = planners.optimiser_of(estimated, state.target, t)
             admits = partial(judge.reserve.recovers, loop, error)
             first = state.predicted == state.scale  # nothing was decided since
-            promised = 0.0 if first else state.predicted - (t - state.since)
+            spent = (t - state.since) * loop.price_of_time
+            promised = 0.0 if first else state.predicted - spent
             found = optimiser.propose(
                 error, incumbent=used, admits=admits, promised=promised, **ask
             )

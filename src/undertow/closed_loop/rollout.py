@@ -281,10 +281,13 @@ class ClosedLoop:
         return TerminalLinearModel(self.mechanism, self.objective, self.ensemble)
 
     @cached_property
-    def counts_time(self) -> bool:
-        """Whether the cost is the time of arrival, a discontinuous function of the plan."""
+    def price_of_time(self) -> float:
+        """What a second costs at rest, where that jumps with the arrival; else 0.
+
+        So it does where Φ(0, 0) > 0 and has no second-order part: the cost is much like a time.
+        """
         stage = quadratic_stage(self.mechanism, self.objective.stage_cost(self.mechanism))
-        return stage is not None and stage.rest > 0 and not stage.quadratic
+        return 0.0 if stage is None or stage.quadratic else stage.rest
 
     @cached_property
     def takes_large_steps(self) -> bool:

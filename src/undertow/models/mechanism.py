@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
@@ -99,7 +100,7 @@ class Mechanism:
     potential
         Potential energy, J, where there is one (used by the energy balance).
     start
-        A usual initial state, by names, for examples and the command line.
+        A usual initial state, by names, for examples and the command line: a copy is kept.
     description, source
         In words, and where the model comes from.
 
@@ -199,6 +200,15 @@ class Mechanism:
         self._check()
         by_names(f"start of '{self.name}'", self.start)
         self.state(**self.start)
+        object.__setattr__(self, "start", MappingProxyType(dict(self.start)))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Give the start as a dict: a view of one cannot be pickled."""
+        return vars(self) | {"start": dict(self.start)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take it back as a view that nobody can write to."""
+        self.__dict__.update(state, start=MappingProxyType(state["start"]))
 
     def _check(self) -> None:
         data = vocabulary(parameters=self.parameters, time=False)
@@ -645,6 +655,8 @@ class Mechanism:
     def check_state(self, x: ArrayLike) -> FloatArray:
         """Return ``x`` as a float array (…, 2n), refusing wrong lengths and NaN.
 
+        Where its columns have names, as pandas has them, they are found by name, in any order.
+
         Raises
         ------
         InvalidInputError
@@ -664,8 +676,18 @@ class Mechanism:
     def _columns(
         self, what: str, values: ArrayLike, names: Sequence[str], remedy: str = ""
     ) -> FloatArray:
-        """Return values as floats, (…, len(names)), or refuse them."""
+        """Return values, by their names where they have some, as floats (…, len(names))."""
         what = f"{what} of '{self.name}'"
+        labels = [] if isinstance(values, Mapping) else list(getattr(values, "keys", tuple)())
+        if labels and all(isinstance(label, str) for label in labels):
+            if not set(names) <= set(labels):
+                raise InvalidInputError(
+                    f"names of the {what}",
+                    value=", ".join(labels),
+                    limit=", ".join(names),
+                    remedy="Give all of them, in any order, or numbers without names",
+                )
+            values = cast(Any, values)[list(names)]
         array = floats(what, values)
         if array.ndim == 0 or array.shape[-1] != len(names):
             raise InvalidInputError(

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
 import numpy as np
+import sympy as sp
 from numpy.typing import ArrayLike
 
 from undertow.base import InvalidInputError, at_least, check_fields, checked
@@ -98,7 +99,7 @@ class Optimiser:
     def _with(self, **changed: object) -> Optimiser:
         """Return this optimiser with some fields changed, and the same first surface."""
         other = object.__new__(type(self))
-        derived = ("space", "firsts", "aims", "plainer")
+        derived = ("space", "firsts", "aims", "plainer", "in_seconds")
         kept = {k: v for k, v in vars(self).items() if k not in derived}
         other.__dict__.update(kept, anchor=self.anchor, designs=self.designs, **changed)
         return other
@@ -122,7 +123,16 @@ class Optimiser:
     @property
     def counts_time(self) -> bool:
         """Whether the cost is the time of arrival, a discontinuous function of the plan."""
-        return self.loop.counts_time
+        return self.loop.price_of_time > 0
+
+    @cached_property
+    def in_seconds(self) -> Optimiser:
+        """The optimiser itself; where the cost is that of time, the one whose seconds cost 1."""
+        price, given = self.loop.price_of_time, self.loop.objective
+        if price in (0.0, 1.0):
+            return self
+        seconds = replace(given, stage=lambda v: sp.sympify(given.stage(v)) / sp.Float(price))
+        return self._with(loop=replace(self.loop, objective=seconds))
 
     @cached_property
     def aims(self) -> bool:
@@ -209,7 +219,7 @@ class Optimiser:
         warm = incumbent is not None
         longest = self.loop.objective.horizon if horizon is None else horizon
         task = self._task(x, longest, budget or self._budget(warm), resolution, sequence, warm)
-        task.admits, task.promised = admits or task.admits, promised
+        task.admits, task.promised = admits or task.admits, promised / task.unit
         task.usual = budget is None and self.warm is None
         if incumbent is None:
             *_, converged = global_search(task)
@@ -256,9 +266,10 @@ class Optimiser:
                 remedy="Leave the ensemble out, or schedule",
             )
         early = 1.0 - min(0.5 * self.loop.tail_rtol, 0.1)  # a prediction may be, by its tolerance
+        unit = self.loop.price_of_time or 1.0
         return Optimisation(
-            self, self.loop.mechanism.check_state(x), horizon * early, budget,
-            resolution=resolution, sequence=sequence, warm=warm,
+            self.in_seconds, self.loop.mechanism.check_state(x), horizon * early, budget,
+            resolution=resolution / unit, sequence=sequence, warm=warm, unit=unit,
         )  # fmt: skip
 
     @checked

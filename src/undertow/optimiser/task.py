@@ -73,6 +73,8 @@ class Optimisation:
         Number of the proposal: with the optimiser's seed it decides all randomness.
     warm
         Whether there is a plan in use.
+    unit
+        What costs are answered in, of those of the optimiser: a search for least time is one in s.
     """
 
     def __init__(
@@ -85,7 +87,9 @@ class Optimisation:
         resolution: float,
         sequence: int,
         warm: bool,
+        unit: float = 1.0,
     ) -> None:
+        self.unit = unit
         self.began = self._last = time.perf_counter()
         self.optimiser, self.loop, self.space = optimiser, optimiser.loop, optimiser.space
         self.x, self.horizon, self.budget = x, horizon, budget
@@ -370,8 +374,8 @@ class Optimisation:
         return Proposal(
             self.best if found or best_effort else None,
             status,
-            self.best_cost if found else math.inf,
-            self.incumbent_cost if self.incumbent_cost < INADMISSIBLE else math.inf,
+            self.best_cost * self.unit if found else math.inf,
+            self.incumbent_cost * self.unit if self.incumbent_cost < INADMISSIBLE else math.inf,
             margins,
             self.evaluations,
             time.perf_counter() - self.began,

@@ -19,7 +19,7 @@ LISTED = 8
 
 def status(campaign: Campaign) -> list[str]:
     """Return how far a store is, and which shards it has not."""
-    marks = Store(campaign.path, campaign.key).marks()
+    marks = Store(campaign.path, campaign.key, campaign.about).marks()
     missing = np.flatnonzero(marks == 0).tolist()
     lines = [f"{campaign.path}: {len(marks) - len(missing)} of {len(marks)} shards"]
     return [*lines, f"not in it: {_listed(missing)}"] if missing else lines
@@ -31,7 +31,7 @@ def alone(campaign: Campaign, shard: int) -> list[str]:
     found = digest(campaign.study.same_bits(arrays))
     said = "there is no store"
     if campaign.path.exists():
-        store = Store(campaign.path, campaign.key)
+        store = Store(campaign.path, campaign.key, campaign.about)
         mark = int(store.marks()[shard])
         said = "the same bits as in the store" if mark else "the store has it not"
         if mark not in (0, found):

@@ -194,7 +194,7 @@ class Campaign:
             When there is one and it is not to be resumed, none that could be, or another one.
         """
         if resume:
-            return Store(self.path, self.key)
+            return Store(self.path, self.key, self.about)
         made_by = {"versions": versions(), "processor": processor()["processor"]}
         return Store.create(self.path, self.study, self.key, self.about | made_by)
 

@@ -10,7 +10,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,14 @@ from undertow.studies.campaign.study import Arrays, Study
 
 #: The mask's name, and that of the dimension that numbers the shards.
 DONE, SHARD = "done", "shard"
+
+#: What a campaign is made from, by the names of what a store says of it.
+PARTS = {
+    "definition": "definition",
+    "mechanism_identity": "mechanism",
+    "code": "--entrant",
+    "code_hashes": "version of an entrant's file",
+}
 
 #: Name and version of the layout.
 FORMAT = "undertow-campaign 1"
@@ -37,6 +45,8 @@ class Store:
         The folder.
     key
         Hash of the campaign that it must hold; ``None`` takes any.
+    mine
+        What its attributes say of that campaign, see :attr:`Campaign.about`.
 
     Raises
     ------
@@ -46,7 +56,9 @@ class Store:
         Without zarr.
     """
 
-    def __init__(self, path: Path, key: str | None = None) -> None:
+    def __init__(
+        self, path: Path, key: str | None = None, mine: Mapping[str, Any] | None = None
+    ) -> None:
         self.path = path
         if not (path / "zarr.json").is_file():
             raise ArtefactError(
@@ -65,12 +77,21 @@ class Store:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise _damaged(path, error) from error
         if form != FORMAT or (key is not None and found != key):
+            names = [*(mine or {}), *self.about] if form == FORMAT else []
+            others = [
+                word
+                for name, word in PARTS.items()
+                if name in names and self.about.get(name) != (mine or {}).get(name)
+            ]
+            if PARTS["code"] in others:  # and then they have other files, too
+                others.pop()
             raise ArtefactError(
                 f"store '{path}'",
-                value=f"another campaign, {printable(str(found))[:12]}, made from other settings, "
-                "another mechanism or another version",
+                value=f"another campaign, {printable(str(found))[:12]}, of another "
+                + (" and another ".join(others) or "version"),
                 limit=f"this one, {str(key)[:12]}" if form == FORMAT else FORMAT,
-                remedy="Name another folder with --out, or remove this one",
+                remedy="Give the file, --mechanism and --entrant that it was begun with, or "
+                "name another folder with --out",
             )
 
     @classmethod
