@@ -58,7 +58,8 @@ def fetch(r: WorkArray) -> str:
     """Fetch the matrices P and A of all lanes."""
     size = len(r.x)
     return f"""\
-for i in range({LANES}):
+for lane in range({LANES}):
+    i = lane
     for j in range({size}):
         for k in range({size}):
             {entry(r.value)} = value[b + i, j, k]
