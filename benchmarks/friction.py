@@ -11,9 +11,10 @@ the friction.  ``--drift`` sets how fast the disturbance may drift; 0 estimates 
 
 *kept*, *exact* and *belief* are those of plants.py.  Where they are asked for: *level*, a belief
 that has friction in its model, of a level that it learns (``Mechanism.with_friction``), and no
-disturbance besides; *free*, a belief whose plans also choose the reaching law.  As in
-``Cascade.simulate``, a decision is due every 0.1 s, and after what was learnt in 20 ms where that
-is news; it has the time until the deadline, and nobody is charged for computing.
+disturbance besides; *free* and *schedule*, beliefs whose plans also choose the reaching law, those
+of plants.py.  As in ``Cascade.simulate``, a decision is due every 0.1 s, and after what was learnt
+in 20 ms where that is news; it has the time until the deadline, and nobody is charged for
+computing.
 
 Reached is ‖x‖ ≤ 0.01 of the true state at a sample, by the deadline, 10 s for energy and 6 s for
 time; cost counts the input as written, until then.  *Over the bound* compares with the best that an
@@ -44,7 +45,6 @@ from plants import (
     RADIUS,
     ROTARY,
     Task,
-    belief,
     cascade,
     drawn,
     first_optimum,
@@ -62,7 +62,7 @@ from undertow.plants import Bench, Friction, RealisticRig, Timing
 from undertow.runtime import estimator_for
 
 NAME = "rotary_pendulum"
-CONTROLLERS = ("kept", "exact", "belief", "level", "free")
+CONTROLLERS = ("kept", "exact", "belief", "level", "free", "schedule")
 PERIOD, STEPS = 0.001, 4
 #: What is watched after arriving, s; how far the pendulum may lean.
 AFTER, FALLEN = 1.0, math.pi / 2
@@ -133,13 +133,6 @@ def level_cascade(objective: str, friction: float) -> ut.Cascade:
     return ut.Cascade(rig, OBJECTIVES[objective], belief=ut.Belief(rig, tolerances))
 
 
-@cache
-def free_cascade(objective: str) -> ut.Cascade:
-    """Return the cascade with a belief that also chooses how fast it reaches its surfaces."""
-    freedom = ut.DecisionVariables(reaching=True)
-    return ut.Cascade(model(NAME), OBJECTIVES[objective], belief=belief(NAME), freedom=freedom)
-
-
 class Steering:
     """A cascade in simulated time, its decisions as in ``Cascade.simulate``, on estimates.
 
@@ -150,7 +143,7 @@ class Steering:
     def __init__(self, run: ut.Cascade, x0: FloatArray, estimator: KalmanFilter) -> None:
         self.run, self.estimator, self.deadline = run, estimator, run.objective.horizon
         self.memory, _ = run.start(x0)
-        surface, reaching = self.memory.plan.at(0.0)
+        self.in_use = surface, reaching = self.memory.plan.at(0.0)
         self.law = InnerLoop(run.mechanism, surface, reaching or run.reaching)
         self.planned_with, self.ticks = self.memory.estimate, 1
 
@@ -159,6 +152,10 @@ class Steering:
         if t >= self.ticks * LEARNING - 1e-9:
             self._decide(self.ticks * LEARNING, x)
             self.ticks += 1
+        surface, reaching = use = self.memory.plan.at(t - self.memory.since + 1e-9)
+        if use != self.in_use:
+            self.in_use = use
+            self.law.use(surface, reaching or self.run.reaching)
         return self.law(x)
 
     def _decide(self, t: float, x: FloatArray) -> None:
@@ -175,8 +172,6 @@ class Steering:
             proposal = run.propose(self.memory, x, t, left)
             self.memory, _ = run.apply_gate(self.memory, proposal, x, left)
             self.planned_with = self.memory.estimate
-            surface, reaching = self.memory.plan.at(0.0)
-            self.law.use(surface, reaching or run.reaching)
 
 
 def steered(
@@ -192,8 +187,6 @@ def steered(
     else:
         if controller == "level":
             run = level_cascade(task.objective, most)
-        elif controller == "free":
-            run = free_cascade(task.objective)
         else:
             run = cascade(NAME, task.objective, controller)
         drift = 0.0 if controller == "level" else drift

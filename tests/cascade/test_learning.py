@@ -65,6 +65,22 @@ def test_a_cascade_learns_the_plant(pendulum: ut.Mechanism) -> None:
 
 
 @pytest.mark.slow
+def test_a_discontinuous_law_arrives_in_least_time_on_a_plant_to_be_learnt() -> None:
+    """As soon as the continuous law, about: its inputs show as well what the plant is."""
+    rig = ut.mechanisms.rotary_pendulum(d_e=0.025)
+    plant = changed(rig, {"m": 0.1, "a_e": -0.05})
+    usual, other = (
+        ut.Cascade(rig, ut.MinimumTime(horizon=6.0), reaching=law).simulate(
+            phi=ut.deg(20), plant=plant
+        )
+        for law in (ut.ReachingLaw(), ut.ReachingLaw(switching="sign"))
+    )
+    assert usual.reached
+    assert other.reached
+    assert other.time < 1.3 * usual.time
+
+
+@pytest.mark.slow
 def test_the_first_plan_is_the_best_for_the_estimate(pendulum: ut.Mechanism) -> None:
     """Nothing is known better yet, and the next decision knows more: no premium for all plants."""
     objective, x = ut.MinimumEnergy(horizon=10.0), pendulum.state(phi=0.5)

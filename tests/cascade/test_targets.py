@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import undertow as ut
 from undertow.base import InvalidInputError
 from undertow.cascade import CascadeState
 from undertow.cascade.simulation import legs_to, moments
+from undertow.models import FloatArray
 
 CRANE = ut.mechanisms.overhead_crane()
 JUMPS = ut.SetPoints([(0, {"x": 1.0}), (2, {"x": -1.0}), (4, {"x": 0.5})])
@@ -21,6 +23,17 @@ def cascade() -> ut.Cascade:
     """Least energy within 8 s, with short searches."""
     objective = ut.MinimumEnergy(horizon=8.0, unit="N² s")
     return ut.Cascade(CRANE, objective, cold=ut.Budget(6144), warm=ut.Budget(96), belief="exact")
+
+
+class Watch:
+    """A planner that remembers when it was asked, s, and how much time it was given, s."""
+
+    def __init__(self, own: ut.Optimiser) -> None:
+        self.own, self.asked = own, list[tuple[float, float | None]]()
+
+    def propose(self, x: FloatArray, /, **rest: Any) -> ut.Proposal:
+        self.asked.append((rest["computed_for"], rest["horizon"]))
+        return self.own.propose(x, **rest)
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +81,21 @@ def test_a_jump_begins_a_new_task_for_lemma_3(run: ut.Run) -> None:
     assert sorted(set(tasks)) == [0, 1, 2]
     assert (np.isnan(run.lemma3_slack) == (np.diff(tasks) > 0)).all()
     assert np.nanmin(run.lemma3_slack) >= -1e-9
+
+
+def test_to_come_back_there_is_a_whole_horizon(cascade: ut.Cascade) -> None:
+    """A load that swings in and out of the terminal set: each time it left, a task afresh."""
+    goal = replace(cascade.objective, terminal_radius=0.3, horizon=3.0)
+    swinging = replace(cascade, objective=goal, cold=ut.Budget(512), period=0.5)
+    watch = Watch(swinging.optimiser)
+    swinging = replace(swinging, planner=watch)
+    run = swinging.simulate(CRANE.state(theta_dot=1.0), target={"x": 0.0}, duration=5.0)
+    assert [t for t, _ in watch.asked] == [update.t for update in run.updates]
+    begun: dict[int, float] = {}
+    for update, (t, horizon) in zip(run.updates, watch.asked, strict=True):
+        left = 3.0 - (t - begun.setdefault(update.task, t))
+        assert (horizon or 3.0) == pytest.approx(left)
+    assert len(begun) >= 3
 
 
 @pytest.mark.slow

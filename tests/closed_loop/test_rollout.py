@@ -312,6 +312,24 @@ def test_a_plant_like_the_belief_changes_nothing_but_rounding(
 # -- reaching and the boundary layer ---------------------------------------------------------
 
 
+def test_a_discontinuous_law_slides_in_continuous_time_and_chatters_where_it_is_held(
+    rig: ut.Mechanism, quick: ut.Surface
+) -> None:
+    """s reaches 0 in ‖s(0)‖/η and stays there, whatever the step; held for h it is off by h η."""
+    reaching, x0 = ut.ReachingLaw(eta=20.0, switching="sign"), rig.state(phi=0.05)
+    reached = float(np.abs(quick.s(x0)[0])) / 20.0
+    ends = {}
+    for step, hold in ((0.002, 0), (0.001, 0), (0.002, 1)):
+        loop = interpreted(ut.ClosedLoop(rig, reaching=reaching, step=step, zoh_steps=hold))
+        run = loop.simulate(x0, quick, duration=reached + 0.06, terminal=0.0)
+        assert np.abs(run.u).max() < 15.0  # within limits, where (16) holds
+        late = np.abs(run.s[(run.t > reached + 0.04) & (run.t < run.t[-1]), 0])
+        assert (late < 1e-5).all() if hold == 0 else late.max() > 0.3 * step * 20.0
+        ends[step, hold] = run.x[-1]
+    off = np.linalg.norm(ends[0.002, 0] - ends[0.001, 0])
+    assert off < 1e-3 * np.linalg.norm(ends[0.001, 0])
+
+
 @pytest.mark.slow  # a kernel of its own; in test_sliding.py NumPy proves the same for any n, m
 def test_sign_switching_reaches_the_surface_within_16_under_disturbance(
     rig: ut.Mechanism, quick: ut.Surface

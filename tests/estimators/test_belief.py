@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,7 +15,7 @@ from scipy.integrate import solve_ivp
 import undertow as ut
 from undertow.base import InvalidInputError
 from undertow.estimators import Belief
-from undertow.estimators.belief import EVEN, LEAST, SLIP_OF_SURFACE, SLIPS
+from undertow.estimators.belief import EVEN, LEAST, SLIP_OF_SURFACE, SLIPS, _signs
 from undertow.law import LawLayout
 from undertow.models import FloatArray
 
@@ -264,6 +265,21 @@ def test_errors_of_state_are_small_beside_the_travel() -> None:
     np.testing.assert_allclose(slips(-1.5, 1.5)[:2], [2e-4, 2e-3])
     np.testing.assert_allclose(slips(-1e-4, 3e-4)[:2], [1e-6, 2e-3])
     np.testing.assert_allclose(slips(0.0, 3e-4)[:2], [3e-6, 2e-3])
+
+
+def test_small_errors_have_all_patterns_of_signs() -> None:
+    """Any three of up to eight; and where there are more, no two always agree or disagree."""
+    for rig in (ut.mechanisms.rotary_pendulum(), ut.mechanisms.double_pendulum_on_a_cart()):
+        belief = Belief.usual(rig)
+        ensemble = belief.ensemble(belief.prior)
+        errors = np.hstack([ensemble.surface_errors[:, 1:], ensemble.state_errors[:, : rig.n]])
+        signs = np.sign(errors[1 : 1 + SLIPS])
+        assert signs.shape[1] <= 8
+        for three in itertools.combinations(signs.T, 3):
+            assert len({*zip(*three, strict=True)}) == 8
+    many = _signs(16)
+    together = many.T @ many / len(many)
+    assert (np.abs(together - np.eye(16)) <= 0.5).all()
 
 
 def test_errors_of_state_and_surface_come_in_pairs_of_one_size(belief: Belief) -> None:

@@ -622,15 +622,19 @@ class Cascade:
         for leg, t, span, due in moments(self, legs, plants):
             truth = plants.get(round(t / self.stride), truth)
             proposal: Proposal | None = None
-            if memory is None or t == leg.begin:
+            home = memory is not None and bool(
+                np.linalg.norm(memory.error(t, x)) <= self.objective.terminal_radius
+            )
+            if t == leg.begin or home or arrived:  # to leave what was reached begins another task
                 since = t
+            if memory is None or t == leg.begin:
                 memory, proposal = first_plan(
                     self._planners, self._judge, x, leg.target, t, memory, leg.longest
                 )
                 admission = self.first_admission(memory, x, leg.longest)
-            elif np.linalg.norm(memory.error(t, x)) <= self.objective.terminal_radius:
-                since = t
-            elif due or is_news(planned_with, memory.estimate) or not self.survives(memory, x, t):
+            elif not home and (
+                due or is_news(planned_with, memory.estimate) or not self.survives(memory, x, t)
+            ):
                 left = leg.longest - (t - since)
                 if left <= 0.5 * self.step:  # a disturbed plant came too late: a new horizon
                     since, left = t, leg.longest
@@ -639,7 +643,7 @@ class Cascade:
                 )
                 memory, admission = self.apply_gate(memory, proposal, x, left)
             if proposal is not None:
-                task += t == leg.begin or arrived  # left what was reached: another task
+                task += not updates or since > updates[-1].t
                 plan, predicted = memory.plan, memory.predicted
                 updates.append(Update(t, x, proposal, admission, plan, predicted, spent, task))
                 spent, planned_with = 0.0, memory.estimate

@@ -15,7 +15,14 @@ import sympy as sp
 
 from undertow.closed_loop.rollout import ClosedLoop
 from undertow.closed_loop.trajectory import Event, Trajectory, recorded
-from undertow.law import Plan, ReferenceMotion, SlidingModeLaw, law_module, pack_law_parameters
+from undertow.law import (
+    LawLayout,
+    Plan,
+    ReferenceMotion,
+    SlidingModeLaw,
+    law_module,
+    pack_law_parameters,
+)
 from undertow.models import TIME, FloatArray, error_dynamics
 from undertow.symbolic import Tape, function_source, scalar_module
 
@@ -103,7 +110,7 @@ def _module(loop: ClosedLoop) -> Any:
     """Return the compiled module of a loop along references: ``along``."""
     key = (
         loop.mechanism.structure, loop.mechanism.name, loop.truth.structure, loop.objective,
-        loop.reaching.switching,
+        loop.reaching.switching, loop.slides,
     )  # fmt: skip
     if key not in _MODULES:
         _MODULES[key] = _made(loop)
@@ -112,7 +119,8 @@ def _module(loop: ClosedLoop) -> Any:
 
 def _made(loop: ClosedLoop) -> Any:
     plant, objective = loop.truth, loop.objective
-    law = law_module(error_dynamics(loop.mechanism), loop.reaching.switching)
+    believed, switching = error_dynamics(loop.mechanism), loop.reaching.switching
+    law = law_module(believed, switching, implicit=loop.slides)
     stage, path = objective.stage_cost(plant), objective.path_margins(plant)
 
     def functions() -> tuple[str, str, str]:
@@ -175,6 +183,8 @@ def simulate_along(
     plain, plant, m = loop.mechanism, loop.truth, loop.mechanism.m
     laws = zip(plan.surfaces, plan.laws(loop.reaching), strict=True)
     lanes = np.stack([pack_law_parameters(SlidingModeLaw(plain, s, law)) for s, law in laws])
+    if loop.slides:
+        lanes[:, LawLayout(plain.n, m).layer] = step
     times = np.arange(steps) * step
     segments = np.searchsorted(plan.times, times + 1e-9, side="right") - 1
     halves = start + np.arange(2 * steps + 1) * (0.5 * step)

@@ -85,6 +85,8 @@ class RolloutBuffers:
         last = self.layout.size - 1
         lanes[:count, :, :eta] = surfaces
         lanes[:count, :, eta:last] = numbers.law if laws is None else laws
+        if self.loop.slides:
+            lanes[:count, :, self.layout.layer] = self.loop.step
         lanes[:count, :, last] = gamma_determinant(numbers.coupling, surfaces)
         self.states[:count] = states
         if self.padded > count:

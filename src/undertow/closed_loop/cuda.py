@@ -96,6 +96,7 @@ class CudaText:
             loop._given,
             loop.objective,
             loop.reaching.switching,
+            sampled=loop.zoh_steps > 0,
             many_plants=loop.ensemble is not None,
         )
         source = kernel_source(graph, sampled=loop.zoh_steps > 0, header="")

@@ -23,13 +23,15 @@ def build_loop_graph(
     objective: Objective,
     switching: Switching,
     *,
+    sampled: bool = False,
     many_plants: bool = False,
 ) -> LoopGraph:
     """Compose law, plant and objective on one tape.
 
     With ``plant=None`` both share symbols, so everything they have in common is computed
     once; otherwise the belief keeps its own parameter symbols.  With ``many_plants`` each lane
-    brings the parameters of its plant.
+    brings the parameters of its plant.  Unless it is ``sampled``, a discontinuous law acts in
+    continuous time: it slides, and its lanes bring the length of a step in the places of ε.
     """
     truth = belief if plant is None else plant
     x = truth.x
@@ -47,8 +49,9 @@ def build_loop_graph(
     lane_inputs = (*symbols.vector, *(truth.parameter_symbols if many_plants else ()))
     tape = Tape([*plant_parameters, *belief_parameters, *limits, *lane_inputs])
     law = build_law_graph(
-        belief.partition(tape, rename), x, symbols, switching, belief.disturbance_bounds
-    )
+        belief.partition(tape, rename), x, symbols, switching, belief.disturbance_bounds,
+        implicit=switching == "sign" and not sampled,
+    )  # fmt: skip
     inputs = dict(zip(truth.u, applied, strict=True))
     qdd = truth.partition(tape).accelerations(sp.Matrix(applied))
     stage, *path = tape.let_all(
@@ -132,7 +135,9 @@ def _generated(
     )
 
     def write() -> str:
-        program = build_loop_graph(belief, plant, objective, switching, many_plants=many_plants)
+        program = build_loop_graph(
+            belief, plant, objective, switching, sampled=sampled, many_plants=many_plants
+        )
         header = f"Closed loop of {belief.name}, {objective.name}; generated, do not edit."
         return source(program, sampled=sampled, header=header)
 

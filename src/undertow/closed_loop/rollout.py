@@ -129,8 +129,7 @@ class ClosedLoop:
     rtol
         Relative tolerance of motions that are integrated one by one, see
         :mod:`undertow.closed_loop.adaptive_integrator`: those of :meth:`simulate`, and batches that
-        ask for it.  0: steps of ``step``, as batches take them; so with ``switching="sign"``, whose
-        chatter is that of the steps.
+        ask for it.  0: steps of ``step``, as batches take them; so with ``switching="sign"``.
     tail_rtol
         Relative tolerance of the large steps that a batch takes once the law is in its boundary
         layer, see :mod:`undertow.closed_loop.exponential_integrator`; 0: small steps to the end.
@@ -279,6 +278,11 @@ class ClosedLoop:
         if not (has_linear_model(self.mechanism) and has_linear_model(self.truth)):
             return None
         return TerminalLinearModel(self.mechanism, self.objective, self.ensemble)
+
+    @property
+    def slides(self) -> bool:
+        """Whether the law is discontinuous and acts in continuous time: it does not chatter."""
+        return self.reaching.switching == "sign" and not self.zoh_steps
 
     @cached_property
     def price_of_time(self) -> float:

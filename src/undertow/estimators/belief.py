@@ -367,9 +367,10 @@ class Belief:
         """Return an ensemble whose members 1 to ``SLIPS`` have small errors of state and surface.
 
         What is best for exact numbers alone may stand on a knife's edge: least time into a small
-        ball does.
+        ball does.  Half of them are designed, the others are their opposites, so that any three of
+        up to eight errors have all patterns of signs.
         """
-        mechanism, rng = self.mechanism, np.random.default_rng(0)
+        mechanism = self.mechanism
         n, m = mechanism.n, mechanism.m
         scale = [
             min(
@@ -380,10 +381,11 @@ class Belief:
         ]
         surface_errors = np.zeros((len(values), 2 * m * n))
         state_errors = np.zeros((len(values), 2 * n))
-        half = SLIPS // 2  # then the same with the other sign
-        surface_errors[1 : 1 + half] = SLIP_OF_SURFACE * rng.choice([-1.0, 1.0], (half, 2 * m * n))
-        LawLayout(n, m).blocks(surface_errors).alpha_a[:] = 0.0
-        state_errors[1 : 1 + half, :n] = scale * rng.choice([-1.0, 1.0], (half, n))
+        free = np.ones(2 * m * n, dtype=bool)
+        LawLayout(n, m).blocks(free).alpha_a[:] = False
+        signs, half = _signs(2 * m * n - m * m + n), SLIPS // 2
+        surface_errors[1 : 1 + half, free] = SLIP_OF_SURFACE * signs[:, :-n]
+        state_errors[1 : 1 + half, :n] = scale * signs[:, -n:]
         for errors in (surface_errors, state_errors):
             errors[1 + half : 1 + SLIPS] = -errors[1 : 1 + half]
         return Ensemble(mechanism, values, self.risk, weights, surface_errors, state_errors)
@@ -576,6 +578,16 @@ def _design(count: int) -> FloatArray:
     while len(signs) <= count:
         signs = np.block([[signs, signs], [signs, -signs]])
     return signs[:, 1 : count + 1]
+
+
+def _signs(count: int) -> FloatArray:
+    """Return signs, (SLIPS / 2, count): up to eight columns are at right angles.
+
+    Of up to sixteen, with those times a quadratic Boolean function, none are nearer than 60°.
+    """
+    signs = np.hstack([np.ones((SLIPS // 2, 1)), _design(SLIPS // 2 - 1)])
+    bent = 0.5 * (signs[:, 0] + signs[:, 1] + signs[:, 2] - signs[:, 3])
+    return np.hstack([signs, bent[:, None] * signs])[:, np.arange(count) % SLIPS]
 
 
 def _contracted(

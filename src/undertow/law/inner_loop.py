@@ -168,14 +168,18 @@ def step(x, lane, block):
 
 
 @lru_cache(maxsize=64)
-def law_module(mechanism: Mechanism, switching: Switching) -> Any:
-    """Return the compiled module of a law: ``law``, and ``step`` on a :data:`LAYOUT`."""
+def law_module(mechanism: Mechanism, switching: Switching, *, implicit: bool = False) -> Any:
+    """Return the compiled module of a law: ``law``, and ``step`` on a :data:`LAYOUT`.
+
+    ``implicit``: as for :func:`undertow.law.build_law_graph`.
+    """
 
     def functions() -> tuple[str, str]:
         tape, symbols = Tape(), LawSymbols.of(mechanism.n, mechanism.m)
         law = build_law_graph(
-            mechanism.partition(tape), mechanism.x, symbols, switching, mechanism.disturbance_bounds
-        )
+            mechanism.partition(tape), mechanism.x, symbols, switching,
+            mechanism.disturbance_bounds, implicit=implicit,
+        )  # fmt: skip
         body = function_source(
             "law",
             tape,
@@ -189,5 +193,5 @@ def law_module(mechanism: Mechanism, switching: Switching) -> Any:
         return body, _CLIP
 
     sizes = f"p, m = {len(mechanism.parameters)}, {mechanism.m}\n"
-    depends = mechanism.structure, switching
+    depends = mechanism.structure, switching, repr(implicit)
     return scalar_module("law", "Sliding-mode law", mechanism.name, depends, functions, sizes)

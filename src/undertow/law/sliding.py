@@ -79,8 +79,15 @@ def build_law_graph(
     symbols: LawSymbols,
     switching: Switching,
     disturbance_bounds: Sequence[float],
+    *,
+    implicit: bool = False,
 ) -> LawOnTape:
     """Lay the sliding-mode law (5), (10), (12), (13) on the tape of a partition.
+
+    With ``implicit`` sign(s) is that of implicit Euler, s₊ = s − h K sign(s₊), for steps of h, s,
+    which stand in the places of ε: K sign(s₊) = min(K, max(−K, s/h)).  So the law slides on s = 0,
+    as it does in continuous time, where sign(s) would chatter by what a step of some length moves
+    it (Acary and Brogliato, Systems & Control Letters 59(5), 2010).
 
     ``margin`` is det Γ(q) / det Γ(0): 1 at the target, 0 where the law ceases to exist,
     (37).  Where it is exactly 0 the tiny number 1e-300 stands in, so no NaN can arise.
@@ -97,8 +104,14 @@ def build_law_graph(
     gamma = tape.matrix(alpha_a - alpha_u * part.X)
     adjugate, determinant = tape.adjugate(gamma)
     gains = _gains(part, alpha_a, alpha_u, symbols.eta, disturbance_bounds)
+    pushes = zip(s, gains, symbols.layer, strict=True)
     push = sp.Matrix(
-        [gains[i] * _switch(tape, s[i], symbols.layer[i], switching) for i in range(m)]
+        [
+            sp.Max(-k, sp.Min(k, tape.let(one / e)))
+            if implicit
+            else k * _switch(tape, one, e, switching)
+            for one, k, e in pushes
+        ]
     )
     drive = tape.matrix(alpha_u * part.y + lambda_a * qd_a + lambda_u * qd_u + push)
     safe = sp.Piecewise((determinant, sp.Ne(determinant, 0)), (sp.Float(1e-300), True))

@@ -326,7 +326,9 @@ class ReachingLaw:
         Half-widths ε_i > 0 of the boundary layer (39), in the units of s.  Not used by
         ``"sign"``.
     switching
-        ``"saturation"`` (39), ``"tanh"`` or ``"sign"`` (12).
+        ``"saturation"`` (39), ``"tanh"`` or ``"sign"`` (12).  The last is discontinuous: sampled
+        every h s it chatters, s by about h η, and no terminal set that is smaller can be held.  A
+        closed loop in continuous time slides on s = 0.
     """
 
     eta: float | tuple[float, ...] = 20.0
