@@ -141,8 +141,8 @@ class Optimisation:
         return self._from_cold(optimiser, most)
 
     def for_one_plant(self) -> Optimisation | None:
-        """The task for the estimate alone, and a single surface; ``None`` without an ensemble."""
-        if self.loop.ensemble is None:
+        """The task for the estimate alone, a single surface; ``None`` where there is no other."""
+        if self.loop.ensemble is None or len(self.loop.ensemble.values) == 1:
             return None
         optimiser = self.optimiser.on(replace(self.loop, ensemble=None))
         if optimiser.space.segments > 1 or optimiser.freedom.schedule:
