@@ -49,7 +49,7 @@ def test_a_law_vector_lies_where_its_layout_says(name: str) -> None:
 def test_a_reaching_law_is_exchanged_with_the_surface_or_stays(
     rig: ut.Mechanism, base: ut.Surface, quick: ut.Surface
 ) -> None:
-    """What is not given is kept."""
+    """What is not given is kept, and so are the limits of the mechanism's inputs."""
     x, soft = rig.state(phi=0.02, theta=0.1), ut.ReachingLaw(3.0, 0.5)
     law = InnerLoop(rig, base, soft)
     law.use(quick)
@@ -58,6 +58,7 @@ def test_a_reaching_law_is_exchanged_with_the_surface_or_stays(
     hard = ut.ReachingLaw(8.0, 0.2)
     law.use(quick, hard)
     assert law(x)[0] == pytest.approx(float(ut.SlidingModeLaw(rig, quick, hard)(0.0, x).u[0]))
+    assert law(rig.state(phi=0.9)).tolist() == [-rig.inputs[0].limit]  # of 37 V that it asks for
 
 
 def test_along_a_plan_the_surface_in_force_is_obeyed(

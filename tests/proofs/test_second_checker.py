@@ -21,6 +21,7 @@ import pytest
 from typer.testing import CliRunner
 
 import undertow as ut
+from support import rest_slow
 from undertow.cli import app
 from undertow.proofs.claims.document import document_bytes
 from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
@@ -376,9 +377,7 @@ def mutant(source: random.Random) -> Document:
 
 
 @needs_compiler
-@pytest.mark.parametrize(
-    ("seed", "documents"), [(16, 20), pytest.param(1, 300, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("seed", "documents"), rest_slow([(16, 20), (16, 60), (1, 300)], (16, 20)))
 def test_mutants_are_decided_alike_and_nothing_false_is_proved(
     program: Path, tmp_path: Path, seed: int, documents: int
 ) -> None:

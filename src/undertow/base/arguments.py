@@ -146,8 +146,9 @@ def at_least(what: str, value: float, low: float, remedy: str = "") -> None:
     InvalidInputError
         With the value and the limit.
     """
-    remedy = remedy or f"Any whole number from {low:g} will do"
-    require(value >= low, what, value, f"≥ {low:g}", remedy)
+    if not value >= low:  # in loops: the words are made where they are needed
+        remedy = remedy or f"Any whole number from {low:g} will do"
+        raise InvalidInputError(what, value=value, limit=f"≥ {low:g}", remedy=remedy)
 
 
 def between(

@@ -17,6 +17,11 @@ from undertow.objective import Objective
 from undertow.symbolic import Tape, content_key, generated
 
 
+def slides(switching: Switching, *, sampled: bool) -> bool:
+    """Whether a law is discontinuous and acts in continuous time: it does not chatter."""
+    return switching == "sign" and not sampled
+
+
 def build_loop_graph(
     belief: Mechanism,
     plant: Mechanism | None,
@@ -50,7 +55,7 @@ def build_loop_graph(
     tape = Tape([*plant_parameters, *belief_parameters, *limits, *lane_inputs])
     law = build_law_graph(
         belief.partition(tape, rename), x, symbols, switching, belief.disturbance_bounds,
-        implicit=switching == "sign" and not sampled,
+        implicit=slides(switching, sampled=sampled),
     )  # fmt: skip
     inputs = dict(zip(truth.u, applied, strict=True))
     qdd = truth.partition(tape).accelerations(sp.Matrix(applied))

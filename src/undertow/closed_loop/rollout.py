@@ -35,7 +35,7 @@ from undertow.closed_loop.adaptive_integrator import follow
 from undertow.closed_loop.buffers import NOTHING, RolloutBuffers
 from undertow.closed_loop.ensemble import TAIL, Ensemble, summarise
 from undertow.closed_loop.exponential_integrator import GIVEN_BACK
-from undertow.closed_loop.kernel import compile_look, compile_loop
+from undertow.closed_loop.kernel import compile_look, compile_loop, slides
 from undertow.closed_loop.linear_model import Prepared, TerminalLinearModel, quadratic_stage
 from undertow.closed_loop.threads import shared
 from undertow.closed_loop.trajectory import Batch, Event, Trajectory, recorded
@@ -282,7 +282,7 @@ class ClosedLoop:
     @property
     def slides(self) -> bool:
         """Whether the law is discontinuous and acts in continuous time: it does not chatter."""
-        return self.reaching.switching == "sign" and not self.zoh_steps
+        return slides(self.reaching.switching, sampled=self.zoh_steps > 0)
 
     @cached_property
     def price_of_time(self) -> float:

@@ -78,13 +78,10 @@ class Store:
             raise _damaged(path, error) from error
         if form != FORMAT or (key is not None and found != key):
             names = [*(mine or {}), *self.about] if form == FORMAT else []
-            others = [
-                word
-                for name, word in PARTS.items()
-                if name in names and self.about.get(name) != (mine or {}).get(name)
-            ]
-            if PARTS["code"] in others:  # and then they have other files, too
-                others.pop()
+            differ = {n for n in names if self.about.get(n) != (mine or {}).get(n)}
+            if "code" in differ:  # other files have other hashes
+                differ.discard("code_hashes")
+            others = [word for name, word in PARTS.items() if name in differ]
             raise ArtefactError(
                 f"store '{path}'",
                 value=f"another campaign, {printable(str(found))[:12]}, of another "
