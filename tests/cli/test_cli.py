@@ -393,7 +393,7 @@ def test_a_box_binds_the_motion_and_one_that_breaks_is_named() -> None:
     _, free, _ = run("optimise", RIG, *words)
     code, out, _ = run("optimise", RIG, *words, "--box", "theta=60deg")
     assert code == 0
-    found = re.search(r"\|theta\| ≤ 60° +([-\d.]+) +°", out)
+    found = re.search(r"\|theta\| ≤ 60° +([-+\d.e]+) +°", out)
     assert found is not None
     assert 0 <= float(found[1]) < 10
     assert cost(out) > cost(free)

@@ -106,7 +106,9 @@ def test_the_quick_start_runs_from_the_wheel(
         env=_plain() | {"UNDERTOW_CACHE": str(tmp_path / "cache"), "MPLBACKEND": "agg"},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert re.search(
-        r"balanced after 1\.\d+ s; keeping the first surface takes 1\.\d+ s", done.stdout
-    )
+    (shown,) = re.findall(r"```text\n(.*?)```", readme, re.DOTALL)[:1]
+    seconds = [[float(v) for v in re.findall(r"([\d.]+) s", w)] for w in (done.stdout, shown)]
+    # Other versions of the compiler round otherwise, and a cascade goes another way: 1.02 for 0.93.
+    assert seconds[0] == [pytest.approx(s, rel=r) for s, r in zip(seconds[1], (0.15, 0.05))]
+    assert seconds[0][0] < seconds[0][1]
     assert (tmp_path / "motion.png").read_bytes().startswith(b"\x89PNG")
