@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -12,9 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from undertow.base import InvalidInputError
+from undertow.closed_loop import INADMISSIBLE
 from undertow.models import FloatArray
 from undertow.optimiser import CMAES
 from undertow.optimiser.cma_es import minimise
+from undertow.optimiser.search import LONG_PAUSE, _descend
 
 Cost = Callable[[FloatArray], FloatArray]
 
@@ -193,3 +197,34 @@ def test_refuses_unusable_settings(mean: list[float], sigma: float, population: 
     """NaN, a negative or infinite σ and a tiny population are refused."""
     with pytest.raises(InvalidInputError, match="of the search"):
         CMAES(np.array(mean), sigma, population, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("members", [None, 17])
+def test_a_descent_on_many_plants_ends_where_it_gains_no_more(members: int | None) -> None:
+    """A pause ends it there, but for one on the way to a first plan that arrives; alone it goes on.
+
+    The spread of a descent along a valley is no sign that it is done: on 17 plants each generation
+    takes 17 times as long.
+    """
+    spent: list[float] = []
+
+    def cost(z: FloatArray) -> FloatArray:
+        values = 1.0 + 1e-9 * (z**2).sum(axis=1)
+        late = len(spent) < 45 * len(z)  # nothing arrives, and hardly anything comes nearer
+        found = np.where(late, 10 * INADMISSIBLE * (1.0 + 1e-9 * values), values)
+        spent.extend(found.tolist())
+        return np.asarray(found)
+
+    task = SimpleNamespace(
+        optimiser=SimpleNamespace(population=8, counts_time=False),
+        loop=SimpleNamespace(ensemble=None if members is None else range(members)),
+        rng=np.random.default_rng(5), cost=cost, resolution=0.0, warm=False, left=8 * 200,
+        late=lambda: False,
+    )  # fmt: skip
+    converged = _descend(cast(Any, task), np.full(3, 5.0), 1.0, 8 * 200, 0.0)
+    generations = len(spent) / 8
+    assert min(spent) < INADMISSIBLE
+    if members is None:
+        assert (generations, converged) == (200, False)
+    else:
+        assert (generations, converged) == (46 + LONG_PAUSE, True)

@@ -18,7 +18,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import cache
+from functools import cache, partial
 from itertools import chain
 
 import numpy as np
@@ -47,6 +47,10 @@ PATIENCE, GAIN = 8, 3e-3
 #: Searches with a model from the best of so many draws each, after a global search of a smooth
 #: cost, to see where they end; and their evaluations, in terms of the model.
 RESTARTS, TRIED, TERMS = 11, 64, 24
+
+#: Where a rollout is one on each of many plants: so many generations that together gain less than
+#: this part of the cost end a descent.
+LONG_PAUSE, SLOW = 30, 1e-4
 
 #: Widest spread of a first population along a ridge.
 FAR = 0.25
@@ -87,16 +91,22 @@ LONG = 10.0
 def _descend(
     task: Optimisation, z: FloatArray, sigma: float, evaluations: int, tolerance: float
 ) -> bool:
-    search = CMAES(z, sigma, task.optimiser.population, task.rng)
-    minimise(
-        search,
-        task.cost,
-        evaluations=min(evaluations, task.left),
-        tolerance=tolerance,
-        # Times of arrival improve in jumps: a pause is no sign that the search is done.
-        resolution=0.0 if task.optimiser.counts_time else task.resolution,
-        stop=lambda: task.left < search.population or task.late(),
-    )
+    search, most = CMAES(z, sigma, task.optimiser.population, task.rng), min(evaluations, task.left)
+    # Times of arrival improve in jumps: a pause is no sign that the search is done.
+    smooth = not task.optimiser.counts_time
+    resolution = task.resolution if smooth else 0.0
+    pauses = smooth and task.loop.ensemble is not None and not (task.warm or resolution)
+
+    def ends() -> bool:
+        return task.left < search.population or task.late()
+
+    def arrives() -> bool:
+        return pauses and search.best_f < INADMISSIBLE
+
+    run = partial(minimise, search, task.cost, tolerance=tolerance)
+    spent = run(evaluations=most, resolution=resolution, stop=lambda: ends() or arrives())
+    if arrives() and not search.converged:
+        run(evaluations=most - spent, relative=SLOW, patience=LONG_PAUSE, stop=ends)
     return search.converged
 
 
