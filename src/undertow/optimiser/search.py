@@ -50,7 +50,7 @@ RESTARTS, TRIED, TERMS = 11, 64, 24
 
 #: Where a rollout is one on each of many plants: so many generations that together gain less than
 #: this part of the cost end a descent.
-LONG_PAUSE, SLOW = 60, 1e-4
+LONG_PAUSE, SLOW = 40, 1e-4
 
 #: Widest spread of a first population along a ridge.
 FAR = 0.25
