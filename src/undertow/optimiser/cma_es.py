@@ -187,6 +187,7 @@ def minimise(
     resolution: float = 0.0,
     relative: float = 0.0,
     patience: int = 4,
+    below: float | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> int:
     """Run a search until its budget is spent, it has converged, or ``stop()`` says so.
@@ -205,6 +206,8 @@ def minimise(
         The same as a part of the best cost; whichever is larger counts.
     patience
         Generations.
+    below
+        Generations count for that from the first one on whose best costs less; ``None``: all do.
 
     Returns
     -------
@@ -222,6 +225,7 @@ def minimise(
         bests.append(search.best_f)
         worth = max(resolution, relative * abs(search.best_f))
         stagnant = len(bests) > patience and not bests[-1 - patience] - bests[-1] > worth
+        stagnant = stagnant and (below is None or bests[-1 - patience] < below)
         search.converged = search.spread <= tolerance or (worth > 0 and stagnant)
         if search.converged:
             break

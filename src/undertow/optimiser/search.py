@@ -18,8 +18,9 @@ References
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import cache, partial
+from functools import cache
 from itertools import chain
+from typing import Any
 
 import numpy as np
 
@@ -91,22 +92,22 @@ LONG = 10.0
 def _descend(
     task: Optimisation, z: FloatArray, sigma: float, evaluations: int, tolerance: float
 ) -> bool:
-    search, most = CMAES(z, sigma, task.optimiser.population, task.rng), min(evaluations, task.left)
+    search = CMAES(z, sigma, task.optimiser.population, task.rng)
     # Times of arrival improve in jumps: a pause is no sign that the search is done.
     smooth = not task.optimiser.counts_time
     resolution = task.resolution if smooth else 0.0
-    pauses = smooth and task.loop.ensemble is not None and not (task.warm or resolution)
-
-    def ends() -> bool:
-        return task.left < search.population or task.late()
-
-    def arrives() -> bool:
-        return pauses and search.best_f < INADMISSIBLE
-
-    run = partial(minimise, search, task.cost, tolerance=tolerance)
-    spent = run(evaluations=most, resolution=resolution, stop=lambda: ends() or arrives())
-    if arrives() and not search.converged:
-        run(evaluations=most - spent, relative=SLOW, patience=LONG_PAUSE, stop=ends)
+    pause: dict[str, Any] = {}
+    if smooth and task.loop.ensemble is not None and not (task.warm or resolution):
+        pause = {"relative": SLOW, "patience": LONG_PAUSE, "below": INADMISSIBLE}
+    minimise(
+        search,
+        task.cost,
+        evaluations=min(evaluations, task.left),
+        tolerance=tolerance,
+        resolution=resolution,
+        stop=lambda: task.left < search.population or task.late(),
+        **pause,
+    )
     return search.converged
 
 
