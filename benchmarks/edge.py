@@ -11,7 +11,8 @@ the model says.  Then the same with
 
 signs at random, some draws for each start.  Printed is the ratio of the cost to that of the
 unchanged plan; what does not arrive any more is inadmissible, and counted apart: draws, and starts
-that lose one.  *Premium*: what the plan of the belief costs over the exact one, unchanged.
+that lose one.  *Premium*: what the plan of the belief costs over the exact one, unchanged;
+*premium, run*: the same of the whole cascades, which decide until they arrive.
 """
 
 from __future__ import annotations
@@ -43,10 +44,12 @@ class Found:
 
     ``cost`` is that of each start's plan, unchanged, s, infinite where there is none; ``ratio``
     those of each change, (draws,) for each start, infinite where the motion does not arrive;
-    ``margin`` the smallest det Γ(q)/det Γ(0) on the way, unchanged.
+    ``margin`` the smallest det Γ(q)/det Γ(0) on the way, unchanged; ``run`` the time of the
+    whole cascade, s, infinite where it does not arrive.
     """
 
     cost: list[float] = field(default_factory=list)
+    run: list[float] = field(default_factory=list)
     ratio: dict[str, list[FloatArray]] = field(
         default_factory=lambda: {name: [] for name in CHANGES}
     )
@@ -100,6 +103,8 @@ def studied(
         except InfeasibleError:
             cost = np.inf
         found.cost.append(cost)
+        run = cascade.simulate(x) if np.isfinite(cost) else None
+        found.run.append(run.time if run is not None and run.reached else np.inf)
         if np.isfinite(cost):
             found.margin.append(float(alone.singular[0]))
             for name, values in changed(loop, x, surface, draws, rng).items():
@@ -159,9 +164,11 @@ def main() -> None:
             f"usual, d_e = {damping:g}: median {median:.3f}, worst {worst:.3f}, {lost} "
             f"inadmissible (wanted: {MEDIAN:.2f}, {WORST:.2f}, 0): {'yes' if met else 'no'}"
         )
-        usual, exact = (np.array(found[one].cost) for one in BELIEFS)
-        both = np.isfinite(usual) & np.isfinite(exact)
-        rows.append(row("premium", (usual[both] / exact[both])[:, None]))
+        for name in ("cost", "run"):
+            usual, exact = (np.array(getattr(found[one], name)) for one in BELIEFS)
+            both = np.isfinite(usual) & np.isfinite(exact)
+            kind = "premium, run" if name == "run" else "premium"
+            rows.append(row(kind, (usual[both] / exact[both])[:, None]))
         title = (
             f"least time, d_e = {damping:g}, {starts} starts, {asked.draws} draws: ratio of costs"
         )

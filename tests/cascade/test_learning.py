@@ -413,6 +413,45 @@ def test_only_exact_states_leave_it_to_later_decisions(
     assert (after.plan == plan) == (not noise)
 
 
+def test_a_first_plan_looks_ahead_to_the_next_decision(pendulum: ut.Mechanism) -> None:
+    """It suits all plants and stays if nothing is decided; the next decision begins with more."""
+    made = replace(scheduled(pendulum), freedom=ut.DecisionVariables())
+    x = pendulum.state(phi=ut.deg(30))
+    state, proposal = made.start(x)
+    assert state.plan == proposal.plan
+    assert made.loop.batch(x, state.plan).reached[0]
+    exact = ut.ClosedLoop(pendulum, made.objective)
+    met = exact.batch(x, state.plan, duration=made.period, terminal=0.0).x[0]
+    best = ut.Optimiser(exact).require(met).cost
+    assert state.ahead is not None
+    assert exact.batch(met, state.ahead).cost[0] == pytest.approx(best, rel=0.03)
+    proposed = made.propose(state, met, made.period)
+    decided, admission = made.apply_gate(state, proposed, met)
+    assert admission.accepted
+    assert decided.predicted <= 1.001 * best
+    assert decided.ahead is None
+    alone = made.propose(replace(state, ahead=None), met, made.period)
+    assert proposed.cost <= alone.cost
+    assert proposed.incumbent_cost == alone.incumbent_cost
+    # Nothing is looked ahead to where states have errors: what is chosen has to suit all plants.
+    noisy = replace(made, covariance=1e-8 * np.eye(4))
+    assert noisy.start(x)[0].ahead is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("degrees", [25.0, 35.0])
+def test_what_a_belief_costs_on_the_model_itself(degrees: float) -> None:
+    """Least time: little, once the motion has shown that the model is right."""
+    rig = ut.mechanisms.rotary_pendulum(d_e=0.025)
+    usual, exact = (
+        ut.Cascade(rig, ut.MinimumTime(), belief=belief).simulate(phi=ut.deg(degrees))
+        for belief in ("usual", "exact")
+    )
+    assert usual.reached
+    assert exact.reached
+    assert usual.time < 1.15 * exact.time  # 1.27 and 1.42 where nothing is looked ahead to
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_a_schedule_for_a_plant_that_is_not_the_model(pendulum: ut.Mechanism, sign: int) -> None:

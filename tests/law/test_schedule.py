@@ -57,6 +57,21 @@ def test_what_is_left_of_a_plan_goes_on_as_the_plan_does(
     np.testing.assert_allclose(left.times[1:], np.array(TIMES[index(passed) + 1 :]) - passed)
 
 
+@pytest.mark.parametrize("laws", [None, LAWS])
+@pytest.mark.parametrize("passed", [0.05, 0.1, 0.2, 0.9])
+def test_a_plan_is_followed_by_another(
+    laws: tuple[ut.ReachingLaw, ...] | None, passed: float
+) -> None:
+    """Until then the one, from then on the other, as from its start."""
+    plan, other = Plan(SURFACES, TIMES, laws), Plan(SURFACES[1::2], (0.0, 0.15), LAWS[:2])
+    both = plan.followed_by(other, passed, USUAL)
+    for t in np.arange(0.0, 1.5, 0.01) + 0.005:
+        one, since = (plan, t) if t < passed else (other, t - passed)
+        surface, law = one.at(since)
+        assert both.at(t) == (surface, law or USUAL)
+    assert both.times[-1] == pytest.approx(passed + 0.15)
+
+
 def test_shifted_times_are_whole_nanoseconds() -> None:
     """Shifts add up to what one shift gives: no rounding of 0.1 s is kept."""
     plan = Plan(SURFACES[:2], (0.0, 0.7))

@@ -228,6 +228,18 @@ def test_state_constraint_binds_and_is_kept(rig: ut.Mechanism) -> None:
     assert motions[1].cost > motions[0].cost
     assert proposal.margins[-1].name.startswith("|theta|")
     assert 0 <= proposal.margins[-1].value < 0.1
+    # What breaks the bound by a hair is repaired close by, and costs as much.
+    rng = np.random.default_rng(0)
+    near = proposal.surface.vector * (1 + 1e-4 * rng.standard_normal((32, 4)))
+    broken = next(v for v in near if not loop.batch(x, v).reached[0])
+    plan = ut.Plan.of(ut.Surface.from_vector(broken, 2, 1))
+    repaired = ut.Optimiser(loop).repair(x, replace(proposal, plan=plan))
+    assert repaired.surface is not None
+    assert loop.batch(x, repaired.surface).reached[0]
+    assert repaired.margins[-1].value >= 0
+    assert repaired.cost == pytest.approx(proposal.cost, rel=2e-3)
+    assert repaired.confidence == proposal.confidence
+    assert repaired.evaluations <= 512
 
 
 @pytest.mark.slow

@@ -135,7 +135,9 @@ class Judge:
         loop = self.predictions.at(state, t)
         used = state.at(t)
         old = self.standing(replace(state, since=t), loop, used, error, span)
-        state = replace(state, plan=old, since=t, sequence=proposal.sequence, x=as_numbers(error))
+        state = replace(
+            state, plan=old, since=t, sequence=proposal.sequence, x=as_numbers(error), ahead=None
+        )
         mends, mended = (
             plan is not None and self.mendable(state, loop, plan, error, span)
             for plan in (old, proposal.plan)

@@ -15,11 +15,11 @@ from undertow.cascade.judge import Judge
 from undertow.cascade.planners import Planners
 from undertow.cascade.predictions import costs_along
 from undertow.cascade.state import CascadeState, as_numbers
-from undertow.closed_loop import INADMISSIBLE, ClosedLoop
+from undertow.closed_loop import INADMISSIBLE, ClosedLoop, Event
 from undertow.estimators import ParameterEstimate
 from undertow.law import Plan, ReferenceMotion
 from undertow.models import FloatArray
-from undertow.optimiser import Proposal
+from undertow.optimiser import Optimiser, Proposal
 
 #: How much more a first plan may cost than the search found, as a factor, before it is searched for
 #: again in smaller steps; and how much smaller they are.
@@ -73,18 +73,22 @@ def first_plan(
     single = None
     if belief is not None and known is not None:
         single = whole.believing(whole.mechanism, belief.single(known))
-    last = [] if single is None else [(single, None)]
+    last = [] if single is None else [(single, None, False)]
     tries: list[FirstTry] = []
-    for loop, fixed in [*_first_tries(planners, known), *last]:
-        if loop is single and tries[-1].proposal.plan is not None:
+    for loop, fixed, near in [*_first_tries(planners, known), *last]:
+        found = tries[-1].proposal if tries else None
+        if loop is single and found is not None and found.plan is not None:
             break
         about, planner = predictions.about(loop, target, t), planners.of(loop, target, t)
         if fixed is not None:
             planner = planners.suited(fixed).on(predictions.about(fixed, target, t))
-        proposal = planner.propose(
-            x, incumbent=None, horizon=horizon if short else None, sequence=0, computed_for=t,
-            resolution=0.0,
-        )  # fmt: skip
+        span = horizon if short else None
+        if near and found is not None and isinstance(planner, Optimiser):
+            proposal = planner.repair(x, found, horizon=span)
+        else:
+            proposal = planner.propose(
+                x, incumbent=None, horizon=span, sequence=0, computed_for=t, resolution=0.0
+            )
         plan = proposal.plan
         if plan is None:
             tries.append(FirstTry(3, math.inf, proposal))
@@ -113,24 +117,48 @@ def first_plan(
         k = int(np.argmin(costs))
         plan, cost = plans[k], costs[k]
     begun = CascadeState(plan, number, cost, cost, t, as_numbers(x), known, target)
+    mends = planners.recourse and planners.own is None
+    if mends and best.rank < 3 and not (target is not None and target.moves):
+        begun = replace(begun, ahead=_ahead(planners, judge, begun, x, horizon))
     return begun, replace(proposal, sequence=number)
+
+
+def _ahead(
+    planners: Planners, judge: Judge, begun: CascadeState, x: FloatArray, span: float
+) -> Plan | None:
+    """What will be best for the estimate at the next decision; ``None`` without any such plan.
+
+    That decision has no time to search for it from nothing.
+    """
+    predictions, period = judge.predictions, judge.period
+    estimated = predictions.estimated_at(begun)
+    motion = estimated.batch(x, begun.plan, duration=period, terminal=0.0)
+    there = motion.radius[0] <= judge.objective.terminal_radius
+    if there or motion.event[0] != Event.HORIZON or span <= period:
+        return None
+    known = predictions.estimated(begun.estimate)
+    optimiser = planners.optimiser_of(known, begun.target, begun.since)
+    return optimiser.propose(motion.x[0], horizon=span - period).plan
 
 
 def _first_tries(
     planners: Planners, estimate: ParameterEstimate | None
-) -> list[tuple[ClosedLoop, ClosedLoop | None]]:
+) -> list[tuple[ClosedLoop, ClosedLoop | None, bool]]:
     """What the first plan is to be best on, one after the other; and in what steps, if fixed.
+
+    And whether the plan of the try before is repaired, in place of a search from nothing.
 
     Before anything has moved, what suits every plausible plant suits none of them well: the
     estimate alone comes first, for a plan that the next decision replaces; a schedule for it
     without any error before.  Where its plan does not do what it promised, small steps
     throughout follow: for one plant, which is integrated to the tolerance, smaller ones than
-    usual.
+    usual.  With many plants and a smooth cost that plan is repaired first: what costs least goes up
+    to a bound, and small steps may find it broken by a hair.
     """
     predictions, belief = planners.predictions, planners.predictions.belief
     whole = predictions.plausible(estimate)
     if planners.own is not None:
-        return [(whole, None)]
+        return [(whole, None, False)]
     loops = [whole]
     if belief is not None and estimate is not None:
         loops.insert(0, whole.believing(whole.mechanism, belief.alone(estimate)))
@@ -141,7 +169,12 @@ def _first_tries(
         adapts = loop.ensemble is None and not loop.zoh_steps
         return loop.with_steps(predictions.prior.step / FINER, 0.0) if adapts else loop
 
-    return [(loop, fixed) for loop in loops for fixed in (None, smaller(loop))]
+    tries: list[tuple[ClosedLoop, ClosedLoop | None, bool]] = []
+    for loop in loops:
+        small = smaller(loop)
+        near = loop.ensemble is not None and not loop.price_of_time
+        tries += [(loop, None, False), *[(loop, small, True)] * near, (loop, small, False)]
+    return tries
 
 
 def next_plan(
@@ -175,12 +208,25 @@ def next_plan(
             first = state.predicted == state.scale  # nothing was decided since
             spent = (t - state.since) * loop.price_of_time
             promised = 0.0 if first else state.predicted - spent
-            found = optimiser.propose(
-                error, incumbent=used, admits=admits, promised=promised, **ask
-            )
-            plans = [used] if found.plan is None else [found.plan, used]
-            if any(judge.mendable(here, loop, plan, error, span) for plan in plans):
-                return found
+            begins = [(used, promised)]
+            if state.ahead is not None:
+                begins.append((state.ahead, math.inf))
+            answers = [
+                optimiser.propose(error, incumbent=plan, admits=admits, promised=cost, **ask)
+                for plan, cost in begins
+            ]
+            mended = [
+                one for one in answers
+                if one.plan is not None and judge.mendable(here, loop, one.plan, error, span)
+            ]  # fmt: skip
+            if mended or judge.mendable(here, loop, used, error, span):
+                best = min(mended or answers[:1], key=lambda one: one.cost)
+                return replace(
+                    best,
+                    incumbent_cost=answers[0].incumbent_cost,
+                    evaluations=sum(one.evaluations for one in answers),
+                    seconds=sum(one.seconds for one in answers),
+                )
         planner = planners.of(predictions.plausible(state.estimate), state.target, t)
         standing = judge.standing(here, loop, used, error, span)
         return planner.propose(error, incumbent=standing, **ask)

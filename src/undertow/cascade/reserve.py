@@ -62,13 +62,5 @@ class Reserve:
 
     def recovers(self, loop: ClosedLoop, error: FloatArray, plan: Plan) -> bool:
         """Whether one would bring every plausible plant home after the next period of a plan."""
-        k = sum(t < self.period - 1e-9 for t in plan.times)
-        plans = [
-            Plan(
-                plan.surfaces[:k] + last.surfaces,
-                (*plan.times[:k], self.period),
-                plan.laws(self.reaching)[:k] + last.laws(self.reaching),
-            )
-            for last in self.plans
-        ]
+        plans = [plan.followed_by(last, self.period, self.reaching) for last in self.plans]
         return bool(loop.batch(error, plans).reached.any())

@@ -20,7 +20,8 @@ class CascadeState:
     ``estimate`` what is known of the plant's parameters, where the cascade learns them;
     ``target`` where the target is, where it is not at x = 0: ``x`` is counted from it;
     ``disturbance`` how large a matched disturbance is, in the inputs' units, (m,), where it is
-    estimated.
+    estimated; ``ahead`` what will be best for the estimate at the decision after the first, a plan
+    from then on, which that begins with.
     """
 
     plan: Plan
@@ -32,6 +33,7 @@ class CascadeState:
     estimate: ParameterEstimate | None = None
     target: ReferenceMotion | None = None
     disturbance: tuple[float, ...] = ()
+    ahead: Plan | None = None
 
     @property
     def surface(self) -> Surface:

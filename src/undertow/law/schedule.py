@@ -120,6 +120,20 @@ class Plan:
         laws = None if self.reaching is None else self.reaching[k:]
         return replace(self, surfaces=self.surfaces[k:], times=times, reaching=laws)
 
+    @checked
+    def followed_by(self, other: Plan, t: float, otherwise: ReachingLaw) -> Self:
+        """Return this plan until t > 0, s, and another one from then on.
+
+        ``otherwise`` is the reaching law of those surfaces that have none.
+        """
+        k = sum(begin < t - 1e-9 for begin in self.times)
+        return replace(
+            self,
+            surfaces=self.surfaces[:k] + other.surfaces,
+            times=(*self.times[:k], *(round(t + later, 9) for later in other.times)),
+            reaching=self.laws(otherwise)[:k] + other.laws(otherwise),
+        )
+
     @staticmethod
     @checked
     def align(

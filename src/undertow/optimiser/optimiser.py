@@ -18,7 +18,9 @@ from undertow.law import Plan, Surface, check_surface, first_surface, quadratic_
 from undertow.models import FloatArray
 from undertow.optimiser.proposal import Budget, Proposal
 from undertow.optimiser.search import (
+    CLOSE_BY,
     FINE,
+    descend_close_by,
     global_search,
     local_search,
     restart_budget,
@@ -230,6 +232,35 @@ class Optimiser:
         if warm and self.loop.ensemble is not None:
             task.fall_back()
         return task.answer(converged, computed_for)
+
+    @checked
+    def repair(self, x: ArrayLike, proposal: Proposal, *, horizon: float | None = None) -> Proposal:
+        """Look close by for what is admissible, and as good, where a plan is not.
+
+        For a plan that was searched for on a loop in larger steps: at its optimum a bound is
+        active, and smaller steps find it broken by a hair.
+
+        Parameters
+        ----------
+        x
+            State, (2n,).
+        proposal
+            With the plan, and with the confidence that the answer takes over.
+        horizon
+            Longest prediction, s; the objective's by default.
+
+        Returns
+        -------
+        Proposal
+            Infeasible where nothing close by is admissible.
+        """
+        plan, longest = proposal.plan, self.loop.objective.horizon if horizon is None else horizon
+        if plan is None:
+            return proposal
+        task = self._task(x, longest, Budget(CLOSE_BY), 0.0, proposal.sequence, False)
+        converged = descend_close_by(task, plan)
+        answer = task.answer(converged, proposal.computed_for)
+        return replace(answer, confidence=proposal.confidence)
 
     @checked
     def improve(

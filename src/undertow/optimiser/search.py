@@ -78,6 +78,9 @@ FEW, AROUND, NEAR_AND_FAR, FRUITLESS = 24, 8, (-1.5, 0.3), 6
 #: time; and the evaluations that improving them may take, per coordinate of a single one.
 DIVIDED, SOON, NEARLY_ALL, FINE = 5, 1 / 8, 0.95, 10240
 
+#: Evaluations, and the spread of the first population, where a plan all but does.
+CLOSE_BY, HAIR = 512, 1e-3
+
 #: Evaluations for a single surface where no schedule arrives; twice as many without any plan.
 ALONE = 1024
 
@@ -109,6 +112,13 @@ def _descend(
         **pause,
     )
     return search.converged
+
+
+def descend_close_by(task: Optimisation, plan: Plan) -> bool:
+    """Descend from a plan that all but does, whether or not it is admissible."""
+    here = task.begin(plan)
+    task.score_incumbent(here)
+    return _descend(task, here, HAIR, task.left, 1e-3)
 
 
 def global_search(task: Optimisation) -> Iterator[bool]:

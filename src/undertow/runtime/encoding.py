@@ -258,9 +258,10 @@ def memory_from(value: Mapping[str, Any], reference: ReferenceMotion | None = No
         raise ValueError("a target that moves, in a run without one")
     if q is not None and q != MOVING:
         target = ReferenceMotion.at_rest(np.array(q, dtype=float))
-    learnt = value.get("estimate")
+    learnt, ahead = value.get("estimate"), value.get("ahead")
     changed = {
         "plan": _plan_from(value["plan"]),
+        "ahead": None if ahead is None else _plan_from(ahead),
         "x": x,
         "target": target,
         "estimate": None if learnt is None else _estimate_from(learnt),
