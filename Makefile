@@ -13,6 +13,9 @@ DOCS  := $(VENV)/.installed-docs
 CHECKER  := build/undertow-checker
 OPTIMISE := -O2
 
+# Python keeps what it compiles, whatever the environment says: the tests start many processes.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help setup demo test slow check bench docs checker clean
