@@ -335,6 +335,31 @@ def test_state_that_is_not_a_number_is_refused(optimisers: dict[str, ut.Optimise
         optimisers["time"].propose([0.0, np.nan, 0.0, 0.0])
 
 
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_no_answer_is_one_that_the_caller_does_not_admit(
+    optimisers: dict[str, ut.Optimiser], name: str
+) -> None:
+    """What the search finds otherwise is not admitted; the answer is, and better than before."""
+    optimiser = optimisers[name]
+    x = optimiser.loop.mechanism.state(phi=0.4)
+    incumbent = ut.first_surface(optimiser.loop.mechanism)
+    free = optimiser.propose(x, incumbent=incumbent, budget=ut.Budget(1024))
+    assert free.surface is not None
+    first, best = (float(one.lambda_u[0, 0]) for one in (incumbent, free.surface))
+    answers: list[bool] = []
+
+    def admits(plan: ut.Plan) -> bool:
+        slope = float(plan.surfaces[0].lambda_u[0, 0])
+        answers.append(abs(slope - first) < abs(slope - best))
+        return answers[-1]
+
+    found = optimiser.propose(x, incumbent=incumbent, budget=ut.Budget(1024), admits=admits)
+    assert found.plan is not None
+    assert admits(found.plan)
+    assert not all(answers)
+    assert found.cost < found.incumbent_cost
+
+
 @pytest.mark.parametrize("ask", [ut.Optimiser.propose, ut.Optimiser.improve])
 def test_a_sequence_below_zero_is_refused_at_once(
     optimisers: dict[str, ut.Optimiser], ask: Any

@@ -211,14 +211,18 @@ def next_plan(
             begins = [(used, promised)]
             if state.ahead is not None:
                 begins.append((state.ahead, math.inf))
-            answers = [
-                optimiser.propose(error, incumbent=plan, admits=admits, promised=cost, **ask)
-                for plan, cost in begins
-            ]
-            mended = [
-                one for one in answers
-                if one.plan is not None and judge.mendable(here, loop, one.plan, error, span)
-            ]  # fmt: skip
+            answers: list[Proposal] = []
+            mended: list[Proposal] = []
+            scheduled = optimiser.freedom.schedule > 0
+            # Of single surfaces the best one mostly is admissible; asking all takes long.
+            for asked in (admits,) if scheduled else (None, admits):
+                for plan, cost in begins if not mended else ():
+                    found = optimiser.propose(
+                        error, incumbent=plan, admits=asked, promised=cost, **ask
+                    )
+                    answers.append(found)
+                    if found.plan and judge.mendable(here, loop, found.plan, error, span):
+                        mended.append(found)
             if mended or judge.mendable(here, loop, used, error, span):
                 best = min(mended or answers[:1], key=lambda one: one.cost)
                 return replace(

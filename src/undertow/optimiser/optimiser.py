@@ -207,8 +207,8 @@ class Optimiser:
         budget
             Overrides ``warm`` or ``cold``.
         admits
-            Whether a schedule that arrives is admissible besides; where the incumbent is not, the
-            answer may be worse.
+            Whether a plan that arrives is admissible besides, asked of each that is better than
+            all before; where the incumbent is not, the answer may be worse.
         promised
             What the incumbent was to cost, in a search for an earlier arrival: where nothing near
             it does, a single surface is looked for far and wide, too.
@@ -221,7 +221,7 @@ class Optimiser:
         warm = incumbent is not None
         longest = self.loop.objective.horizon if horizon is None else horizon
         task = self._task(x, longest, budget or self._budget(warm), resolution, sequence, warm)
-        task.admits, task.promised = admits or task.admits, promised / task.unit
+        task.admits, task.promised = admits, promised / task.unit
         task.usual = budget is None and self.warm is None
         if incumbent is None:
             *_, converged = global_search(task)

@@ -103,7 +103,7 @@ class Optimisation:
         self._unscored: Plan | None = None
         self._pace = 0.0
         self.kept = 0
-        self.admits: Callable[[Plan], bool] = lambda _: True
+        self.admits: Callable[[Plan], bool] | None = None
         self.promised, self.usual = math.inf, False
         self.minima: list[float] = []
         self._buffers: dict[int, RolloutBuffers] = {}
@@ -216,7 +216,12 @@ class Optimisation:
             scores, guide = _among(len(z), stable, scores), _among(len(z), stable, guide)
         if incumbent is not None:
             self._adopt(incumbent, z[0].copy(), float(scores[0]))
-        best = self._believed(z, scores, guide) if self._doubts else int(np.argmin(scores))
+        if self._doubts:
+            best = self._believed(z, scores, guide)
+        elif self.admits is not None:
+            best = self._admitted(z, scores, guide, self.admits)
+        else:
+            best = int(np.argmin(scores))
         if scores[best] < self.best_cost:
             self.best_cost, self.best_z = float(scores[best]), z[best].copy()
             self._best = None
@@ -256,6 +261,17 @@ class Optimisation:
         scores[better] = math.inf
         if broken:  # like those before
             guide[better] = INADMISSIBLE
+        return int(np.argmin(scores))
+
+    def _admitted(
+        self, z: FloatArray, scores: FloatArray, guide: FloatArray, admits: Callable[[Plan], bool]
+    ) -> int:
+        """Ask whether those that better the best plan are admitted, until one is; return which."""
+        for k in np.argsort(scores, kind="stable")[:DOUBTED]:
+            if not scores[k] < self.best_cost or admits(self.space.plan(z[k])):
+                return int(k)
+            scores[k], guide[k] = math.inf, max(guide[k], INADMISSIBLE)
+        scores[scores < self.best_cost] = math.inf
         return int(np.argmin(scores))
 
     def _seeks(self) -> bool:
@@ -306,7 +322,7 @@ class Optimisation:
         stable = loop.linear_end or stability_margin(loop.mechanism, incumbent.surfaces[-1]) > 0
         self.evaluations += 1
         score = float(batch.score(self.horizon)[0]) if stable else UNSTABLE
-        admitted = score >= INADMISSIBLE or self.admits(incumbent)
+        admitted = score >= INADMISSIBLE or self.admits is None or self.admits(incumbent)
         self._adopt(incumbent, here, score if admitted else UNSTABLE)
         return here
 
@@ -324,7 +340,7 @@ class Optimisation:
         self.evaluations += EXACT
         score = float(batch.score(self.horizon)[0])
         if score < self.best_cost and stability_margin(self.loop.mechanism, plan.surfaces[-1]) > 0:
-            if not self.admits(plan):
+            if self.admits is not None and not self.admits(plan):
                 return False
             self._best, self.best_z, self.best_cost = plan, self.space.encode(plan), score
         return True
