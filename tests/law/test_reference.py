@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import sympy as sp
 from scipy.integrate import solve_ivp
 
 import undertow as ut
@@ -46,10 +48,14 @@ def test_the_error_has_the_dynamics_of_the_mechanism(mechanism: ut.Mechanism) ->
 
 
 def test_what_is_invariant_is_found_symbolically() -> None:
-    """Carts, arms and wheels; a coordinate that cancels counts, a slope does not."""
+    """Carts, arms and wheels; what cancels counts, and so does the track on a slope."""
     assert invariant_coordinates(ut.mechanisms.wheeled_inverted_pendulum()) == ("phi",)
     assert invariant_coordinates(ut.mechanisms.reaction_wheel_pendulum()) == ("psi",)
     assert invariant_coordinates(ut.mechanisms.tora()) == ()
+    crane = ut.mechanisms.overhead_crane()
+    x, phi = crane.q
+    for potential, found in ((9.81 * x, ("x",)), (x * sp.sin(phi), ()), (x**2, ())):
+        assert invariant_coordinates(replace(crane, potential=potential)) == found
 
 
 @pytest.mark.parametrize(
