@@ -27,7 +27,7 @@ def invariant_coordinates(mechanism: Mechanism) -> tuple[str, ...]:
     """Return the names of the coordinates on which neither M nor f depends.
 
     Their derivatives are taken symbolically, and are zero for all values of the parameters.  Where
-    there is a potential its slopes must not depend on them either: it may rise along a cart's track.
+    there is a potential its slopes do not depend on them either: it may rise along a cart's track.
 
     Examples
     --------
