@@ -173,6 +173,17 @@ def test_energy_is_counted_until_the_terminal_set_is_reached() -> None:
     assert late.cost == pytest.approx(at(0.7 * least.x), rel=1e-4)
 
 
+def test_where_the_target_is_held_by_an_input_time_costs_that_input() -> None:
+    """Least energy against a load c on the first mass is ∫(u + c)² dt of the plant without it."""
+    plant, load, x0 = linear_plant(falling=1.0), 2.0, [0.3, 0.2, 0.0, 0.0]
+    loaded = plant.disturbed({"a": -load})
+    objective = ut.MinimumEnergy(terminal_radius=0.05, horizon=6.0)
+    found = bound(loaded, objective, x0, intervals=20)
+    same = replace(objective, stage=lambda v: (v.force + load) ** 2)
+    assert found.time < 0.5 * objective.horizon
+    assert found.cost == pytest.approx(bound(plant, same, x0, intervals=20).cost, rel=1e-3)
+
+
 @pytest.mark.slow
 def test_an_energy_bound_is_what_the_plant_does_with_its_input() -> None:
     """Applied to a rig sample by sample, u(t) costs and arrives as the bound says."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import sympy as sp
 from scipy.integrate import solve_ivp
 
 import undertow as ut
@@ -46,10 +48,27 @@ def test_the_error_has_the_dynamics_of_the_mechanism(mechanism: ut.Mechanism) ->
 
 
 def test_what_is_invariant_is_found_symbolically() -> None:
-    """Carts, arms and wheels; a coordinate that cancels counts, a slope does not."""
+    """Carts, arms and wheels; what cancels counts, and so does the track on a slope."""
     assert invariant_coordinates(ut.mechanisms.wheeled_inverted_pendulum()) == ("phi",)
     assert invariant_coordinates(ut.mechanisms.reaction_wheel_pendulum()) == ("psi",)
     assert invariant_coordinates(ut.mechanisms.tora()) == ()
+    crane = ut.mechanisms.overhead_crane()
+    x, phi = crane.q
+    for potential, found in ((9.81 * x, ("x",)), (x * sp.sin(phi), ()), (x**2, ())):
+        assert invariant_coordinates(replace(crane, potential=potential)) == found
+
+
+def test_masses_that_may_move_together_alone_are_moved_as_the_refusal_says() -> None:
+    """Neither coordinate of two masses on a spring is free by itself: both are in the remedy."""
+    a, b = ut.Coordinate("a", "m"), ut.Coordinate("b", "m")
+    masses = ut.Mechanism.from_energies(
+        "masses", [a, b], [ut.Input("force", "N", 1.0)],
+        kinetic=(a.velocity**2 + b.velocity**2) / 2, potential=(a.symbol - b.symbol) ** 2 / 2,
+    )  # fmt: skip
+    with pytest.raises(InvalidInputError, match=r"move_target\(mechanism, a=1.0, b=1.0\)"):
+        ut.SetPoints([(0, {"a": 1.0, "b": 1.0})]).legs(masses, 1.0)
+    moved = ut.modelling.move_target(masses, a=1.0, b=1.0)
+    assert moved.f(np.zeros(4)) == pytest.approx(masses.f([1.0, 1.0, 0.0, 0.0]), abs=0)
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ import sympy as sp
 import undertow as ut
 from support import interpreted, random_mechanism
 from undertow.base import InvalidInputError
+from undertow.models.importers import holding_input
 from undertow.objective import Goal, objective_for
 from undertow.objective.objective import Names, travel_box
 
@@ -288,6 +289,18 @@ def test_a_constraint_that_excludes_the_target_is_refused_before_the_search(
     goal = ut.MinimumTime(constraints=(away,))
     with pytest.raises(InvalidInputError, match=r"target x = 0.*'away'.*margin -0\.1 rad"):
         goal.check_start(rig, rig.state(theta=0.3))
+
+
+def test_the_room_of_a_constraint_on_the_input_is_that_of_the_held_target(
+    rig: ut.Mechanism,
+) -> None:
+    """A rope that must not go slack would at u = 0, which is not the input at the target."""
+    loaded = rig.disturbed({"theta": -0.02})
+    (u,) = holding_input(loaded)
+    taut = ut.MinimumEnergy(constraints=(ut.Constraint("taut", lambda v: 0.1 - v.voltage),))
+    (margin,) = taut.guarded(loaded).path_margins(loaded)
+    assert u > 0.1
+    assert float(margin.subs({loaded.u[0]: u})) == pytest.approx(0.99 * (u - 0.1))
 
 
 def test_a_box_of_more_than_a_turn_is_asked_about(rig: ut.Mechanism) -> None:

@@ -304,6 +304,25 @@ def test_what_the_inputs_cannot_do_is_said(rig: ut.Mechanism) -> None:
     assert float(said[1]) == pytest.approx(needed, rel=0.01)
 
 
+def test_a_target_that_the_inputs_cannot_hold_is_refused_before_any_search(
+    rig: ut.Mechanism, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def searched(*_args: object, **_words: object) -> None:
+        raise AssertionError("searched")
+
+    monkeypatch.setattr(ut.Optimiser, "propose", searched)
+    loaded = rig.disturbed({"theta": 0.2}).with_input_limit(1.0)
+    said = (
+        r"input 'voltage' that holds the target of '\w+': got \d[.\d]* V, must be below .* of 1\."
+    )
+    x, objective = loaded.state(phi=0.1), ut.MinimumTime()
+    with pytest.raises(InfeasibleError, match=said):
+        ut.Optimiser(ut.ClosedLoop(loaded, objective)).require(x)
+    for belief in ("exact", "usual"):
+        with pytest.raises(InfeasibleError, match=said):
+            ut.Cascade(loaded, objective, belief=belief).start(x)
+
+
 def test_degrees_for_radians_are_told(rig: ut.Mechanism) -> None:
     optimiser = ut.Optimiser(ut.ClosedLoop(rig, ut.MinimumTime(horizon=2.0)), cold=ut.Budget(64))
     with pytest.raises(InfeasibleError, match=r"phi = 20 rad is 1146°.*undertow.deg\(20\)"):

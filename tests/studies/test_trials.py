@@ -10,10 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import sympy as sp
 
 import undertow as ut
-from undertow.base import ArtefactError, as_text
+from undertow.base import ArtefactError, InvalidInputError, as_text
 from undertow.estimators import Record
+from undertow.models.importers import holding_input
 from undertow.objective import objective_for
 from undertow.plants import Bench, Friction, Push, srv02_rig
 from undertow.runtime.controller_defaults import estimator_for
@@ -44,6 +46,25 @@ from undertow.studies.trials.upright import EngineResult, SwingResult
 @pytest.fixture(scope="module")
 def arm() -> ut.Mechanism:
     return ut.mechanisms.rotary_pendulum()
+
+
+def test_predictive_control_holds_a_target_against_a_load(arm: ut.Mechanism) -> None:
+    """Where an input holds the target NMPC's cost counts from it, and it stays there."""
+    pytest.importorskip("casadi")
+    loaded = arm.disturbed({"theta": 0.02})
+    u = ut.nmpc(loaded, ut.MinimumEnergy())(np.zeros(4))(0.0, np.zeros(4))
+    assert abs(holding_input(loaded)[0]) > 0.1
+    np.testing.assert_allclose(u, holding_input(loaded), rtol=1e-3)
+
+
+@pytest.mark.parametrize("free", ["1", "theta**2"])
+def test_predictive_control_for_a_cost_that_no_input_raises_is_refused(
+    arm: ut.Mechanism, free: str
+) -> None:
+    pytest.importorskip("casadi")
+    objective = ut.Objective("free", lambda v: sp.sympify(free, {"theta": v.theta}))
+    with pytest.raises(InvalidInputError, match=r"∂²Φ/∂u² = \[\[0.0\]\].*bench-time"):
+        ut.nmpc(arm, objective)
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ import scipy.linalg
 from undertow.base import InvalidInputError
 from undertow.closed_loop import Trajectory
 from undertow.models import FloatArray, Mechanism, linearise
+from undertow.models.importers import holding_input
 
 
 class Guess(NamedTuple):
@@ -36,7 +37,7 @@ def time_scale(mechanism: Mechanism, longest: float) -> float:
 
 
 def rests(mechanism: Mechanism) -> bool:
-    """Whether the target is stable without input: motions there may take all the time."""
+    """Whether the target is stable under the input that holds it: motions may take all the time."""
     return bool(np.linalg.eigvals(linearise(mechanism).A).real.max() <= 1e-9)
 
 
@@ -56,18 +57,20 @@ def recorded(mechanism: Mechanism, guess: Trajectory | Sequence[Trajectory] | No
                 value=f"{shape[0]} states, {shape[1]} inputs, {len(motion.t)} samples",
                 limit=f"finite, {wanted[0]} states, {wanted[1]} inputs, of some length",
             )
-        out.append(_sampled(f"guess {index}", motion.t - motion.t[0], motion.x, motion.u))
+        name, times = f"guess {index}", motion.t - motion.t[0]
+        out.append(_sampled(name, times, motion.x, motion.u, holding_input(mechanism)))
     return out
 
 
-def _sampled(name: str, t: FloatArray, x: FloatArray, u: FloatArray) -> Guess:
-    """A guess from samples; after their end the last state is held, without input."""
+def _sampled(name: str, t: FloatArray, x: FloatArray, u: FloatArray, held: FloatArray) -> Guess:
+    """A guess from samples; after their end the last state stays, with the input ``held``."""
 
     def states(at: FloatArray) -> FloatArray:
         return np.stack([np.interp(at, t, column) for column in x.T], axis=-1)
 
     def inputs(at: FloatArray) -> FloatArray:
-        return np.stack([np.interp(at, t, column, right=0.0) for column in u.T], axis=-1)
+        columns = zip(u.T, held, strict=True)
+        return np.stack([np.interp(at, t, column, right=last) for column, last in columns], axis=-1)
 
     return Guess(name, float(t[-1]), states, inputs)
 
@@ -76,12 +79,12 @@ def built_in(
     mechanism: Mechanism, x0: FloatArray, scale: float, longest: float, swing: bool
 ) -> Iterator[Guess]:
     """Yield the built-in guesses: decay, saturated linear-quadratic feedback, coasting, swings."""
-    m = mechanism.m
+    held = _held(mechanism)
 
     def decay(t: FloatArray) -> FloatArray:
         return np.asarray(x0 * np.exp(-4.0 * t[:, None] / scale))
 
-    yield Guess("exponential decay", scale, decay, lambda t: np.zeros((len(t), m)))
+    yield Guess("exponential decay", scale, decay, held)
     for found in (_regulated(mechanism, x0, scale, longest), _coasting(mechanism, x0, longest)):
         if found is not None:
             yield found
@@ -89,9 +92,15 @@ def built_in(
         yield from _swings(mechanism, x0, scale, longest)
 
 
+def _held(mechanism: Mechanism) -> Callable[[FloatArray], FloatArray]:
+    """Return the input that holds the target, as a function of times, (N,) to (N, m)."""
+    rest = holding_input(mechanism)
+    return lambda t: np.tile(rest, (len(t), 1))
+
+
 def _regulated(mechanism: Mechanism, x0: FloatArray, scale: float, longest: float) -> Guess | None:
     """Simulate linear-quadratic feedback, clipped; None where it does not arrive."""
-    lin, limits = linearise(mechanism), mechanism.input_limits
+    lin, limits, rest = linearise(mechanism), mechanism.input_limits, holding_input(mechanism)
     weight = np.diag(1.0 / np.where(np.isfinite(limits), limits, 1.0) ** 2)
     try:
         P = scipy.linalg.solve_continuous_are(lin.A, lin.input, np.eye(2 * mechanism.n), weight)
@@ -100,7 +109,7 @@ def _regulated(mechanism: Mechanism, x0: FloatArray, scale: float, longest: floa
     gain = np.linalg.solve(weight, lin.input.T @ P)
 
     def control(x: FloatArray) -> FloatArray:
-        return np.clip(-x @ gain.T, -limits, limits)
+        return np.clip(rest - x @ gain.T, -limits, limits)
 
     def rate(t: float, x: FloatArray) -> FloatArray:
         return np.concatenate([x[mechanism.n :], mechanism.accelerations(t, x, control(x))])
@@ -116,17 +125,17 @@ def _regulated(mechanism: Mechanism, x0: FloatArray, scale: float, longest: floa
     x = run.y.T
     if not run.success or run.t[-1] < span or np.linalg.norm(x[-1]) > np.linalg.norm(x0):
         return None
-    return _sampled("linear-quadratic feedback", run.t, x, control(x))
+    return _sampled("linear-quadratic feedback", run.t, x, control(x), rest)
 
 
 def _coasting(mechanism: Mechanism, x0: FloatArray, longest: float) -> Guess | None:
-    """Let go: the motion without input, ``None`` where the target itself is not stable."""
+    """Let go: the motion under the input that holds the target; None where that is not stable."""
     if not rests(mechanism):
         return None
-    nothing = np.zeros(mechanism.m)
+    rest = holding_input(mechanism)
 
     def rate(_t: float, x: FloatArray) -> FloatArray:
-        return np.concatenate([x[mechanism.n :], mechanism.accelerations(0.0, x, nothing)])
+        return np.concatenate([x[mechanism.n :], mechanism.accelerations(0.0, x, rest)])
 
     run = scipy.integrate.solve_ivp(
         rate, (0.0, longest), x0, rtol=1e-8, atol=1e-10, dense_output=True
@@ -134,9 +143,7 @@ def _coasting(mechanism: Mechanism, x0: FloatArray, longest: float) -> Guess | N
     motion = run.sol
     if not run.success or motion is None:
         return None
-    return Guess(
-        "coasting", longest, lambda t: motion(t).T, lambda t: np.zeros((len(t), mechanism.m))
-    )
+    return Guess("coasting", longest, lambda t: motion(t).T, _held(mechanism))
 
 
 def _swings(mechanism: Mechanism, x0: FloatArray, scale: float, longest: float) -> Iterator[Guess]:
@@ -145,8 +152,8 @@ def _swings(mechanism: Mechanism, x0: FloatArray, scale: float, longest: float) 
     For an angle that starts at φ₀ on the positive side: φ = π − (π − φ₀) cos(2πt/T), then
     to the target; mirrored on the other side.
     """
-    n, m = mechanism.n, mechanism.m
-    for i in range(m, n):
+    n, held = mechanism.n, _held(mechanism)
+    for i in range(mechanism.m, n):
         if mechanism.coordinates[i].unit != "rad":
             continue
         side = math.copysign(1.0, x0[i])
@@ -173,4 +180,4 @@ def _swings(mechanism: Mechanism, x0: FloatArray, scale: float, longest: float) 
                 return x
 
             name = f"swing of {mechanism.coordinates[i].name}, {period:.3g} s"
-            yield Guess(name, duration, states, lambda t: np.zeros((len(t), m)))
+            yield Guess(name, duration, states, held)

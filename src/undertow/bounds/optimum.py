@@ -170,13 +170,14 @@ def bound(
     -----
     *Final time.*  The cost is counted until the terminal set is first reached, as in the
     rollouts, and t_f ≤ horizon is free.  Where rest at the target costs something (minimum
-    time: Φ = 1), shorter is always better.  Where it costs nothing, Φ(0, 0) = 0 (minimum
-    energy), more time mostly helps and t_f is the horizon; but a motion that is held inside
-    the terminal set until then pays for it, about ν² λ_max(P) with P of the linear-quadratic
-    regulator of least effort, and may be cheaper when it ends where it arrives: 0.8 % from a
-    pendubot's small angles.  Gains below 5e-4 of the cost are none: then t_f is the horizon.
-    Of a mechanism that swings about its target every swing has a valley of its own; they are
-    tried one by one.
+    time: Φ = 1, or energy where an input u_e has to hold a load), shorter is mostly better.
+    Where it costs nothing, Φ(0, u_e) = 0 (minimum energy without a load), more time mostly
+    helps and t_f is the horizon; but a motion that is held inside the terminal set until
+    then pays for it, about ν² λ_max(P) with P of the linear-quadratic regulator of least
+    effort, and may be cheaper when it ends where it arrives: 0.8 % from a pendubot's small
+    angles.  Gains below 5e-4 of the cost are none: then t_f is the horizon.  Of a mechanism
+    that swings about its target every swing has a valley of its own; they are tried one by
+    one.
 
     *Basins.*  The built-in guesses go straight to the target.  A mechanism may have other,
     far cheaper ways: a rotary pendulum at 41° that is let fall, swings through the bottom

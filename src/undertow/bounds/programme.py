@@ -15,6 +15,7 @@ from undertow.bounds.expressions import dynamics, smooth
 from undertow.bounds.guesses import Guess, rests, time_scale
 from undertow.bounds.mesh import adapted_mesh, defects, first_mesh
 from undertow.models import FloatArray, Mechanism, require_smooth
+from undertow.models.importers import holding_input
 from undertow.objective import Objective
 
 #: Largest defect (see ``Bound.defect``) that a result may have: coarse meshes let a
@@ -118,14 +119,15 @@ class Programme:
         self.radius = objective.terminal_radius
         stage = objective.stage_cost(mechanism)
         _check_impulses(mechanism, stage)
-        at_rest = stage.subs(
-            mechanism.substitution | dict.fromkeys((*mechanism.x, *mechanism.u), 0)
-        )
-        self.rest_costs = float(at_rest) > 1e-12
+        held = dict(zip(mechanism.u, holding_input(mechanism).tolist(), strict=True))
+        target = mechanism.substitution | dict.fromkeys(mechanism.x, 0) | held
+        self.rest_costs = float(stage.subs(target)) > 1e-12
+        #: Whether another place may cost less than the target: a motion may wait there.
+        self.waits = not self.rest_costs or any(stage.diff(u).subs(target) != 0 for u in held)
         self.scale = time_scale(mechanism, longest)
         limits = np.where(np.isfinite(mechanism.input_limits), mechanism.input_limits, 1.0)
-        # ∫ effort dt weighs every input by its limit: 1 is all inputs at their limits.
-        effort = sum(((u / limit) ** 2 for u, limit in zip(mechanism.u, limits, strict=True)))
+        # ∫ effort dt weighs every input, from the one that holds the target, by its limit.
+        effort = sum(((u - held[u]) / limit) ** 2 for u, limit in zip(held, limits, strict=True))
         margins = [w for m in objective.path_margins(mechanism) for w in smooth(m)]
         # IPOPT's derivatives of a kink are as wrong as anybody's, and it would call "optimal" what
         # is not even a local optimum.
@@ -268,21 +270,33 @@ class Programme:
     def first(self, guess: Guess, count: int) -> Solution:
         """Solve on the first mesh.
 
-        A free final time collapses when it starts far from its optimum.  So where rest costs
-        something the motion of least effort at a fixed time comes first; the time is halved
-        while the inputs have much to spare, and only then released.  Where rest costs nothing
-        the motion until the horizon comes first, and its time is released where it first
-        arrives.
+        Where rest costs something, see :meth:`_hurried`.  Where it costs nothing, or less
+        elsewhere, the motion until the horizon comes first, and its time is released where it
+        first arrives.
         """
-        if not self.rest_costs:
-            even = rests(self.mechanism)
-            mesh = first_mesh(count, 1.0 if even else self.scale / self.longest)
-            held = self.solve(mesh, guess, self.cost, fixed=self.longest)
-            known = np.isclose(held.cost, self._held, rtol=1e-7, atol=0.0).any()
-            if held.status is not None and not known:
-                self._held.append(held.cost)
-                held = self._released(held, count)
-            return held
+        hurried = [self._hurried(guess, count)] if self.rest_costs else []
+        waiting = [self._waiting(guess, count)] if self.waits else []
+        found = hurried + waiting
+        best = min(found, key=lambda s: math.inf if s.status is None else s.cost)
+        return replace(best, iterations=sum(s.iterations for s in found))
+
+    def _waiting(self, guess: Guess, count: int) -> Solution:
+        """Solve until the horizon, and release the final time."""
+        mesh = first_mesh(count, 1.0 if rests(self.mechanism) else self.scale / self.longest)
+        held = self.solve(mesh, guess, self.cost, fixed=self.longest)
+        known = np.isclose(held.cost, self._held, rtol=1e-7, atol=0.0).any()
+        if held.status is not None and not known:
+            self._held.append(held.cost)
+            held = self._released(held, count)
+        return held
+
+    def _hurried(self, guess: Guess, count: int) -> Solution:
+        """Solve for a free final time where rest costs something.
+
+        It collapses when it starts far from its optimum.  So the motion of least effort at a fixed
+        time comes first; the time is halved while the inputs have much to spare, and only then
+        released.
+        """
         spent = 0
         mesh = np.linspace(0.0, 1.0, count + 1)
         durations = {min(guess.time, 2.0 * self.scale), guess.time, 3.0 * guess.time}

@@ -20,6 +20,7 @@ from undertow.estimators import ParameterEstimate
 from undertow.law import Plan, ReferenceMotion
 from undertow.models import FloatArray
 from undertow.optimiser import Optimiser, Proposal
+from undertow.optimiser.proposal import check_held
 
 #: How much more a first plan may cost than the search found, as a factor, before it is searched for
 #: again in smaller steps; and how much smaller they are.
@@ -55,7 +56,7 @@ def first_plan(
     Raises
     ------
     InfeasibleError
-        When no admissible plan was found.
+        When no admissible plan was found, or the inputs cannot hold the target.
     """
     predictions, belief = planners.predictions, planners.predictions.belief
     absolute, horizon = x, min(longest, judge.objective.horizon)
@@ -68,6 +69,7 @@ def first_plan(
     whole = predictions.plausible(known)
     here = predictions.about(whole, target, t)
     here.objective.check_start(here.mechanism, x)
+    check_held(predictions.prior)
     # Where nothing suits every plausible plant, what brings home the estimate, without room for
     # any error: to learn which of the plants it is takes less time than to fall.
     single = None

@@ -237,13 +237,14 @@ class SetPoints:
         names = [c.name for c in mechanism.coordinates]
         if self.times[0] > 0:
             found.append((0.0, ReferenceMotion.at_rest(q)))
-        for t, point in self.pairs:
-            for name, value in by_names(f"set-point of '{mechanism.name}'", point).items():
+        for t, given in self.pairs:
+            point = by_names(f"set-point of '{mechanism.name}'", given)
+            for name, value in point.items():
                 one_of(f"set-point of '{mechanism.name}'", name, mechanism.state_names)
                 if name not in names:
                     _refuse_velocity(mechanism, name, value)
                 elif value != q[names.index(name)]:
-                    _check_invariant(mechanism, name, value)
+                    _check_invariant(mechanism, name, point)
                     q[names.index(name)] = value
             found.append((t, ReferenceMotion.at_rest(q)))
         return tuple(found)
@@ -272,20 +273,23 @@ def _refuse_velocity(mechanism: Mechanism, name: str, value: float) -> None:
         )
 
 
-def _check_invariant(mechanism: Mechanism, name: str, value: float | None = None) -> None:
+def _check_invariant(
+    mechanism: Mechanism, name: str, point: Mapping[str, float] | None = None
+) -> None:
     """Refuse a target, or a reference, along a coordinate on which the equations depend."""
     free = invariant_coordinates(mechanism)
     if name not in free:
+        place = ", ".join(f"{c}={v!r}" for c, v in (point or {}).items())
         raise InvalidInputError(
             f"target of '{mechanism.name}'",
-            value=f"a reference of '{name}'" if value is None else f"{name} = {value:g}",
+            value=f"a reference of '{name}'" if point is None else f"{name} = {point[name]:g}",
             limit=f"moved along {', '.join(free)}, on which neither M nor f depends"
             if free
             else "x = 0: its equations depend on all of its coordinates",
             remedy=""
-            if value is None
+            if point is None
             else "Another equilibrium is the target of a mechanism of its own: "
-            f"undertow.modelling.move_target(mechanism, {name}={value!r})",
+            f"undertow.modelling.move_target(mechanism, {place})",
         )
 
 

@@ -24,9 +24,10 @@ from undertow.models.quantities import FloatArray, Parameter
 
 @lru_cache(maxsize=64)
 def invariant_coordinates(mechanism: Mechanism) -> tuple[str, ...]:
-    """Return the names of the coordinates on which neither M nor f nor the potential depends.
+    """Return the names of the coordinates on which neither M nor f depends.
 
-    Their derivatives are taken symbolically, and are zero for all values of the parameters.
+    Their derivatives are taken symbolically, and are zero for all values of the parameters.  Where
+    there is a potential its slopes do not depend on them either: it may rise along a cart's track.
 
     Examples
     --------
@@ -40,7 +41,7 @@ def invariant_coordinates(mechanism: Mechanism) -> tuple[str, ...]:
     """
     entries = [*mechanism.mass_matrix, *mechanism.force]
     if mechanism.potential is not None:
-        entries.append(mechanism.potential)
+        entries += [sp.diff(mechanism.potential, symbol) for symbol in mechanism.q]
     return tuple(
         c.name
         for c in mechanism.coordinates

@@ -31,7 +31,7 @@ UNCONTROLLABLE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """``M q̈ = F q + D q̇ + (B u, 0)`` at the target, numbers.
+    """``M q̈ = F q + D q̇ + (B u, 0)`` at the target, numbers; u from the input that holds it.
 
     ``M, F, D`` are (n, n), ``B`` (m, m); ``states`` and ``inputs`` are names, in the order of A.
     """
@@ -95,7 +95,7 @@ def linearise(mechanism: Mechanism) -> Linearisation:
     Raises
     ------
     ModelError
-        When the target is no equilibrium for u = 0, or f has no derivative there.
+        When the target is no equilibrium under any input, or f has no derivative there.
     """
     n = mechanism.n
     if not _is_analytic(mechanism.force, mechanism.x):

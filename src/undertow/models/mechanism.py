@@ -781,10 +781,12 @@ class Mechanism:
     def linearise(self) -> Linearisation:
         """Linearise at the target x = 0: ẋ = A x + B u; ``.ss()`` is python-control's.
 
+        u counts from the input that holds the target, ``undertow.modelling.holding_input``.
+
         Raises
         ------
         ModelError
-            When the target is no equilibrium for u = 0, or f has no derivative there.
+            When the target is no equilibrium under any input, or f has no derivative there.
         """
         from undertow.models.linearisation import linearise
 

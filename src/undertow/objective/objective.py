@@ -38,6 +38,7 @@ from undertow.models import (
     shortened,
     vocabulary,
 )
+from undertow.models.importers import holding_input
 from undertow.symbolic import compile_expressions
 
 #: Part of a coordinate's declared travel that a motion may use: the rest is for what no model
@@ -481,11 +482,13 @@ class Objective:
     def guarded(self, mechanism: Mechanism) -> Self:
         """Return the problem with 1 % of the room of each constraint on the input kept.
 
-        The room is −w(0, 0), the margin at the target.  What the input of a law is follows the
-        state: a plan that goes up to such a constraint on one plant breaks it on the next, where
-        one that goes up to a bound of a state is a little late, if anything.
+        The room is −w(0, u), the margin at the target under the input that holds it.  What the
+        input of a law is follows the state: a plan that goes up to such a constraint on one plant
+        breaks it on the next, where one that goes up to a bound of a state is a little late, if
+        anything.
         """
-        at_target = mechanism.substitution | dict.fromkeys([*mechanism.x, *mechanism.u], 0.0)
+        held = dict(zip(mechanism.u, holding_input(mechanism).tolist(), strict=True))
+        at_target = mechanism.substitution | dict.fromkeys(mechanism.x, 0.0) | held
 
         def kept(c: Constraint, margin: sp.Expr) -> Constraint:
             room = margin.subs(at_target)

@@ -16,7 +16,7 @@ from undertow.base import InvalidInputError, at_least, check_fields, checked
 from undertow.closed_loop import ClosedLoop
 from undertow.law import Plan, Surface, check_surface, first_surface, quadratic_designs
 from undertow.models import FloatArray
-from undertow.optimiser.proposal import Budget, Proposal
+from undertow.optimiser.proposal import Budget, Proposal, check_held
 from undertow.optimiser.search import (
     CLOSE_BY,
     FINE,
@@ -312,8 +312,10 @@ class Optimiser:
         InvalidInputError
             For a start that breaks a path constraint itself.
         InfeasibleError
-            When no candidate was admissible; says what the best of them broke.
+            When no candidate was admissible, with what the best of them broke; before any search
+            where the inputs cannot hold the target.
         """
         loop = self.loop
         loop.objective.check_start(loop.mechanism, loop.mechanism.check_state(x))
+        check_held(loop)
         return self.propose(x).required(loop, loop.mechanism.check_state(x))

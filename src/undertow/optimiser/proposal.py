@@ -114,6 +114,7 @@ class Proposal:
             When no candidate was admissible; says what the best of them broke.
         """
         if self.plan is None:
+            check_held(loop)
             raise InfeasibleError(
                 f"no admissible surface for '{loop.mechanism.name}' "
                 f"({loop.objective.name}) among {self.evaluations}",
@@ -121,7 +122,6 @@ class Proposal:
                 limit="every margin ≥ 0 and the terminal set reached within "
                 f"{loop.objective.horizon:g} s",
                 remedy=in_degrees(loop.mechanism.coordinates, loop.mechanism.m, x)
-                or _too_weak(loop)
                 or _turned(loop.mechanism, x) + _too_far(loop, x) + self.remedy,
             )
         return self
@@ -144,15 +144,23 @@ def _turned(mechanism: Mechanism, x: FloatArray) -> str:
     return ""
 
 
-def _too_weak(loop: ClosedLoop) -> str:
-    """What to do where the inputs cannot hold the mechanism at the target; empty where they can."""
+def check_held(loop: ClosedLoop) -> None:
+    """Refuse a target that the inputs cannot hold: no start comes home to stay.
+
+    Raises
+    ------
+    InfeasibleError
+        With the input, what it would have to be there, and its limit.
+    """
     held = np.abs(holding_input(loop.mechanism))
-    weak = [
-        f"{given.name} of {f'{u:.3g} {given.unit}'.rstrip()}, and its limit is {limit:.3g}"
-        for given, u, limit in zip(loop.mechanism.inputs, held, loop.input_limits, strict=True)
-        if u >= limit
-    ]
-    return f"The target is held by {'; '.join(weak)}: no start comes home" if weak else ""
+    for given, u, limit in zip(loop.mechanism.inputs, held, loop.input_limits, strict=True):
+        if u >= limit:
+            raise InfeasibleError(
+                f"input '{given.name}' that holds the target of '{loop.mechanism.name}'",
+                value=f"{u:.3g} {given.unit}".rstrip(),
+                limit=f"below its limit of {limit:.3g}",
+                remedy="Choose a stronger actuator, or another target",
+            )
 
 
 def _too_far(loop: ClosedLoop, x: FloatArray) -> str:

@@ -60,6 +60,8 @@ def nmpc(mechanism: Mechanism, objective: Objective, **settings: Any) -> MakeCon
 
     Raises
     ------
+    InvalidInputError
+        For an objective that does not rise with every input, such as least time.
     MissingExtraError
         Without CasADi.
     """

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.linalg
 import sympy as sp
 
-from undertow.base import require_extra
+from undertow.base import InvalidInputError, require_extra
 from undertow.bounds.expressions import dynamics
 from undertow.cascade import Cascade, CascadeState
 from undertow.estimators import Estimator, StateFeedback
@@ -144,9 +144,17 @@ def cascade_and_kept(cascade: Cascade, x0: FloatArray) -> tuple[MakeController, 
 class NMPC:
     """The optimal-control problem of one mechanism, warm-started from solution to solution.
 
-    The objective gives the stage cost, its quadratic part the terminal cost. A solution is made
-    every ``period``, s, by at most ``iterations`` of the interior-point method, for a ``horizon``,
-    s, in which an input is held for ``step``, s, at a time.
+    The objective gives the stage cost, its quadratic part the terminal cost; inputs count from the
+    one that holds the target. A solution is made every ``period``, s, by at most ``iterations`` of
+    the interior-point method, for a ``horizon``, s, in which an input is held for ``step``, s, at a
+    time.
+
+    Raises
+    ------
+    InvalidInputError
+        For a stage cost that does not rise with every input, such as least time.
+    ModelError
+        For one with kinks, and where no linear feedback stabilises the mechanism.
     """
 
     def __init__(
@@ -163,7 +171,10 @@ class NMPC:
         self.period, self.step, self.count = period, step, round(horizon / step)
         self.size, self.m = 2 * belief.n, belief.m
         limit = belief.input_limits
-        rates = dynamics(ca, belief, objective.stage_cost(belief))
+        self._held = holding_input(belief)
+        stage = objective.stage_cost(belief)
+        P = _terminal(belief, stage, objective.name)
+        rates = dynamics(ca, belief, stage.subs(_shifted(belief, self._held), simultaneous=True))
         x, u = ca.SX.sym("x", self.size), ca.SX.sym("u", self.m)
         k1 = rates(0.0, x, u)[0]
         k2 = rates(0.0, x + step / 2 * k1, u)[0]
@@ -173,7 +184,6 @@ class NMPC:
         X, U = ca.MX.sym("X", self.size, self.count + 1), ca.MX.sym("U", self.m, self.count)
         x0 = ca.MX.sym("x0", self.size)
         gaps = X[:, 1:] - ahead.map(self.count)(X[:, :-1], U)
-        P = _terminal(belief, objective)
         stages = rates.map(self.count)(0.0, X[:, :-1], U)[1]
         cost = step * ca.sum2(stages) + ca.bilin(ca.DM(P), X[:, -1], X[:, -1])
         unknowns = ca.veccat(X, U)
@@ -194,15 +204,15 @@ class NMPC:
 
     def reset(self) -> None:
         """Forget all plans, and count the time from 0 again."""
-        self._guess = np.zeros(self.size * (self.count + 1) + self.m * self.count)
-        self._plan: FloatArray = np.zeros((self.count, self.m))
+        self._plan: FloatArray = np.tile(self._held, (self.count, 1))
+        self._guess: FloatArray | None = None
         self._due = self._began = 0.0
 
     def __call__(self, t: float, x: FloatArray) -> FloatArray:
         """Return the input at (t, x): of the newest plan."""
         if t >= self._due - 1e-9 and np.isfinite(x).all():
-            if not self._guess.any():
-                self._guess[: self.size * (self.count + 1)] = np.tile(x, self.count + 1)
+            if self._guess is None:
+                self._guess = np.append(np.tile(x, self.count + 1), self._plan)
             answer = self._solve(x0=self._guess, p=x, **self._box)
             self._guess = np.asarray(answer["x"]).ravel()
             states = self.size * (self.count + 1)
@@ -212,17 +222,33 @@ class NMPC:
         return np.asarray(self._plan[k])
 
 
-def _terminal(belief: Mechanism, objective: Objective) -> FloatArray:
+def _shifted(belief: Mechanism, held: FloatArray) -> dict[sp.Symbol, sp.Expr]:
+    """What an input becomes that counts from ``held``, (m,)."""
+    return {u: u - rest for u, rest in zip(belief.u, held.tolist(), strict=True) if rest}
+
+
+def _terminal(belief: Mechanism, stage: sp.Expr, name: str) -> FloatArray:
     """Return the value function at the target of the cost's second-order part, (2n, 2n)."""
     lin = linearise(belief)
     symbols = [*belief.x, *belief.u]
-    stage = objective.stage_cost(belief)
-    require_smooth(f"stage cost of '{objective.name}'", [stage], symbols)
+    require_smooth(f"stage cost of '{name}'", [stage], symbols)
     hessian = sp.hessian(stage, symbols).subs(dict.fromkeys(symbols, 0))
     H = 0.5 * np.array(hessian, dtype=float)
     size = 2 * belief.n
     Q, R = H[:size, :size] + 1e-6 * np.eye(size), H[size:, size:]
-    return np.asarray(scipy.linalg.solve_continuous_are(lin.A, lin.input, Q, R), np.float64)
+    limits = finite_limits(belief)
+    if not np.linalg.eigvalsh(R * np.outer(limits, limits)).min() > 0:
+        raise InvalidInputError(
+            f"stage cost of '{name}' for model-predictive control",
+            value=f"∂²Φ/∂u² = {(2 * R).tolist()}",
+            limit="positive definite at the target",
+            remedy="Take one in which every input costs something, for instance "
+            "undertow.objective_for(mechanism, 'bench-time')",
+        )
+    try:
+        return np.asarray(scipy.linalg.solve_continuous_are(lin.A, lin.input, Q, R), np.float64)
+    except np.linalg.LinAlgError as error:
+        raise uncontrollable(belief) from error
 
 
 @dataclass(frozen=True, eq=False)
