@@ -1,6 +1,6 @@
 """What every other package stands on: checks of arguments, errors, verdicts, files and tables."""
 
-from undertow.base.interrupt import INTERRUPTED, at_once, by_exception
+from undertow.base.interrupt import INTERRUPTED, at_once, by_exception, interruptible
 
 at_once()
 
@@ -90,6 +90,7 @@ __all__ = [
     "file_name",
     "finite",
     "floats",
+    "interruptible",
     "inward",
     "manifest",
     "mark",

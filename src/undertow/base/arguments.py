@@ -393,7 +393,7 @@ def _is_array(value: Any) -> bool:
         return False
     try:
         given = np.asarray(value)  # of a complex number the imaginary part would be dropped
-        return given.dtype.kind != "c" and np.asarray(given, dtype=np.float64) is not None
+        return given.dtype.kind in "biufO" and np.asarray(given, dtype=np.float64) is not None
     except (TypeError, ValueError):
         return False
 

@@ -14,7 +14,7 @@ from typing import Annotated
 
 import typer
 
-from undertow.base import INTERRUPTED, at_once, by_exception, versions
+from undertow.base import INTERRUPTED, at_once, versions
 from undertow.cli import (  # noqa: F401 - each registers its commands
     bench,
     campaign,
@@ -79,9 +79,8 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):  # what a terminal cannot show costs no result
             stream.reconfigure(errors="replace")
     try:
-        by_exception()
         app(prog_name="undertow")
-    except KeyboardInterrupt:  # before a command begins, which says so itself
+    except KeyboardInterrupt:  # after a command, which says so itself
         sys.stderr.write("interrupted\n")
         raise SystemExit(INTERRUPTED) from None
     finally:  # what is left is to end

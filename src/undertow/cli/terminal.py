@@ -23,8 +23,10 @@ from undertow.base import (
     INTERRUPTED,
     Progress,
     UndertowError,
+    by_exception,
     check_folder,
     duration,
+    interruptible,
     near,
     printable,
     write_files,
@@ -164,7 +166,9 @@ def _with_errors_in_one_line(function: Callable[P, None]) -> Callable[P, None]:
     @wraps(function)
     def guarded(*args: P.args, **kwargs: P.kwargs) -> None:
         try:
-            function(*args, **kwargs)
+            by_exception()
+            with interruptible():
+                function(*args, **kwargs)
         except KeyboardInterrupt:
             typer.echo("interrupted", err=True)
             raise typer.Exit(INTERRUPTED) from None
@@ -231,7 +235,7 @@ def progress_bar() -> Iterator[Progress]:
 def completed(work: Callable[[Progress], object], kept: Sized = (1,)) -> bool:
     """Work under a progress bar; false where Ctrl-C ended it and something is kept to be shown."""
     try:
-        with progress_bar() as progress:
+        with progress_bar() as progress, interruptible():
             work(progress)
     except KeyboardInterrupt:
         if not kept:

@@ -189,8 +189,9 @@ class Belief:
     bound: float | tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        """Check names and numbers."""
+        """Check names and numbers, and keep a copy of the tolerances."""
         check_fields(self)
+        object.__setattr__(self, "tolerances", dict(self.tolerances))
         one_of("risk of a belief", self.risk, get_args(Risk))
         positive("confidence of a belief", self.confidence, "1 is usual", zero=True)
         known = {p.name: p for p in self.mechanism.parameters}

@@ -417,8 +417,10 @@ class Reference:
     units: Mapping[str, str] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
-        """Refuse what is no function of time."""
+        """Refuse what is no function of time; keep copies."""
         check_fields(self)
+        for name in ("paths", "units"):
+            object.__setattr__(self, name, dict(getattr(self, name)))
         positive("period of a reference, s", self.period, "0 never repeats", zero=True)
         if not self.paths:
             raise InvalidInputError(

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from types import MappingProxyType
@@ -781,6 +782,8 @@ class Mechanism:
     def linearise(self) -> Linearisation:
         """Linearise at the target x = 0: ẋ = A x + B u; ``.ss()`` is python-control's.
 
+        The arrays are the caller's own.
+
         Raises
         ------
         ModelError
@@ -788,7 +791,7 @@ class Mechanism:
         """
         from undertow.models.linearisation import linearise
 
-        return linearise(self)
+        return deepcopy(linearise(self))
 
     def energy(self, x: ArrayLike, t: float = 0.0) -> FloatArray:
         """Return T + V at the states x, (…,), J, at the time t, s.

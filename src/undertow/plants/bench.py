@@ -270,7 +270,10 @@ class Bench:
     source: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse names that the mechanism does not have."""
+        """Refuse names that the mechanism does not have; keep copies."""
+        for name, given in vars(self).items():
+            if isinstance(given, Mapping):
+                object.__setattr__(self, name, dict(given))
         mechanism = self.mechanism
         coordinates = [c.name for c in mechanism.coordinates]
         for what, names, known in (
