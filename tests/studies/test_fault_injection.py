@@ -12,6 +12,7 @@ import pytest
 import undertow as ut
 from undertow.cascade import CascadeState
 from undertow.law import Plan
+from undertow.models import FloatArray
 from undertow.plants import IdealRig
 from undertow.runtime import Columns, InlineWorker, Recipe, Runtime, SimulatedClock, respond
 from undertow.runtime.recording import read_log
@@ -68,6 +69,16 @@ def test_a_fault_ends_as_it_should(part: str, name: str, tmp_path: Path) -> None
     assert outcome.passed, outcome.happened
     if not outcome.case.holds:
         assert outcome.after <= 1.2
+
+
+def test_ctrl_c_ends_the_drill_and_is_no_fault_of_its_list(tmp_path: Path) -> None:
+    """A run takes it for its operator's stop; what the run is a part of has to end as well."""
+
+    def interrupted(_: FloatArray) -> FloatArray:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        short(Case("loop", "Ctrl-C", False, estimator=interrupted), tmp_path)
 
 
 def test_the_list_is_long_and_covers_every_part() -> None:
