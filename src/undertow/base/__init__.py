@@ -22,6 +22,7 @@ from undertow.base.arguments import (
 from undertow.base.artefacts import (
     as_text,
     check_folder,
+    check_place,
     check_replaces,
     facts,
     file_name,
@@ -80,6 +81,7 @@ __all__ = [
     "check_fields",
     "check_file",
     "check_folder",
+    "check_place",
     "check_replaces",
     "checked",
     "duration",

@@ -178,11 +178,16 @@ def _with_errors_in_one_line(function: Callable[P, None]) -> Callable[P, None]:
         except BrokenPipeError:  # who read the output has gone
             raise
         except OSError as error:  # a full disk behind a redirection, a terminal that is closed
-            said, of = error.strerror or str(error), error.filename or "the output"
-            _say_error(f"{of}: got {said}, must be a file that can be written. Name another one")
+            say_unwritten(error)
             raise typer.Exit(1) from None
 
     return guarded
+
+
+def say_unwritten(error: OSError) -> None:
+    """Say that something cannot be written, in one line."""
+    said, of = error.strerror or str(error), error.filename or "the output"
+    _say_error(f"{of}: got {said}, must be a file that can be written. Name another one")
 
 
 def _say_error(text: str) -> None:
