@@ -24,7 +24,7 @@ from typer.main import get_command
 import undertow as ut
 from runs import run
 from undertow.base import ArtefactError, InvalidInputError, write_file
-from undertow.cli import _ORDER, _place, app, main
+from undertow.cli import _ORDER, _place, app, main, terminal
 from undertow.cli.parsing import (
     aimed,
     mechanism_named,
@@ -667,3 +667,17 @@ def test_help_on_a_full_disk_is_one_line(
         main()
     assert left.value.code == 1
     assert capsys.readouterr().err.startswith("error: the output: got No space left on device")
+
+
+def test_what_was_found_is_shown_where_it_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a search of minutes a full disk left nothing of it."""
+
+    def full(*_: object) -> None:
+        raise ArtefactError("results", value="No space left on device")
+
+    monkeypatch.setattr(terminal, "write_files", full)
+    code, out, err = run("optimise", RIG, "--evaluations", "64", "--out", str(tmp_path))
+    assert (code, err.splitlines()[-1]) == (1, "error: results: got No space left on device.")
+    assert "predicted cost" in out

@@ -21,6 +21,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from undertow.base import (
     INTERRUPTED,
+    ArtefactError,
     Progress,
     UndertowError,
     by_exception,
@@ -265,8 +266,9 @@ def carry_out(
     parts: list[RenderableType] = []
     if every or not work.whole:
         result = work.gather(found)
-        written = write(out, lambda: work.files(result))
-        parts = [*work.report(result), *written, *work.notes(result)]
+        said = [*work.report(result)]
+        written = write(out, lambda: work.files(result), *said, **how)
+        parts = [*said, *written, *work.notes(result)]
         if every and written and ledger.path is not None:
             ledger.path.unlink()
     if seed is not None:
@@ -298,14 +300,24 @@ def check_out(out: Path | None) -> None:
         check_folder(out)
 
 
-def write(out: Path | None, files: Callable[[], Mapping[str, bytes]]) -> tuple[str, ...]:
-    """Write results where a folder is named, and return the sentences that say where they are."""
+def write(
+    out: Path | None, files: Callable[[], Mapping[str, bytes]], *parts: RenderableType, **how: Any
+) -> tuple[str, ...]:
+    """Write results where a folder is named, and return the sentences that say where they are.
+
+    Where the disk refuses, ``parts`` are shown first, as :func:`show` does: what was found is not
+    lost.
+    """
     if out is None:
         return ()
     made = files()
     if not made:
         return ()
-    earlier = write_files(out, made)
+    try:
+        earlier = write_files(out, made)
+    except ArtefactError:
+        show(*parts, **how)
+        raise
     written = f"Written to {out}/: {', '.join(made)}"
     return (written,) if earlier is None else (f"Earlier results moved to {earlier}/", written)
 
