@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, cast
@@ -178,6 +180,11 @@ def test_who_gives_or_takes_something_may_change_it_afterwards(rig: ut.Mechanism
     assert belief.tolerances == {"m": 0.02}
     assert list(reference.paths) == ["theta"]
     assert list(bench.friction) == ["phi"]
+    for kept in (belief.tolerances, reference.paths, bench.friction, rig.start):
+        with pytest.raises(TypeError, match="does not support item assignment"):
+            cast(Any, kept)["m"] = 1.0
+    assert pickle.loads(pickle.dumps(belief)).tolerances == belief.tolerances
+    assert copy.deepcopy(bench).friction == bench.friction
     M = rig.linearise().M
     M[:] = math.nan
     assert np.isfinite(rig.linearise().M).all()

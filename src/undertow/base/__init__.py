@@ -17,6 +17,7 @@ from undertow.base.arguments import (
     one_for_each,
     one_of,
     positive,
+    read_only,
     require,
 )
 from undertow.base.artefacts import (
@@ -107,6 +108,7 @@ __all__ = [
     "printable",
     "raised_at",
     "read_file",
+    "read_only",
     "require",
     "require_extra",
     "table",

@@ -7,6 +7,7 @@ All public functions use them: :func:`checked` reads the annotations of a functi
 from __future__ import annotations
 
 import contextlib
+import copyreg
 import inspect
 import math
 import types
@@ -50,6 +51,8 @@ _ARRAY, _SHOWN = "array", 80
 
 P = ParamSpec("P")
 R = TypeVar("R")
+K = TypeVar("K")
+V = TypeVar("V")
 
 
 #: What helps who gives states of another kind or size.
@@ -117,6 +120,14 @@ Give a number in SI units: undertow.deg(10) for an angle of 10°
         return function(*args, **kwargs)  # of a missing or an unknown name Python itself tells
 
     return call
+
+
+def read_only(mapping: Mapping[K, V]) -> types.MappingProxyType[K, V]:
+    """Return a copy of a mapping that nobody can write to; it can be pickled and copied."""
+    return types.MappingProxyType(dict(mapping))
+
+
+copyreg.pickle(types.MappingProxyType, lambda view: (read_only, (dict(view),)))
 
 
 def require(

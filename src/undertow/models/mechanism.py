@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
@@ -29,6 +28,7 @@ from undertow.base import (
     floats,
     one_of,
     positive,
+    read_only,
 )
 from undertow.models.lagrange import derived
 from undertow.models.partition import Partition, compiled
@@ -201,15 +201,7 @@ class Mechanism:
         self._check()
         by_names(f"start of '{self.name}'", self.start)
         self.state(**self.start)
-        object.__setattr__(self, "start", MappingProxyType(dict(self.start)))
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Give the start as a dict: a view of one cannot be pickled."""
-        return vars(self) | {"start": dict(self.start)}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take it back as a view that nobody can write to."""
-        self.__dict__.update(state, start=MappingProxyType(state["start"]))
+        object.__setattr__(self, "start", read_only(self.start))
 
     def _check(self) -> None:
         data = vocabulary(parameters=self.parameters, time=False)
