@@ -231,16 +231,17 @@ def kill_run(recipe: Recipe, moment: float, folder: Path) -> KillResult:
     """
     log, record = folder / "killed.db", folder / "supervisor.json"
     victim = fork(_victim, (recipe, log, record), "undertow victim", daemon=False)
-    first = _first_line(log, victim)
-    time.sleep(max(0.0, first + moment - time.perf_counter()))
-    victim.kill()
-    killed = time.perf_counter()
-    victim.join()
-    recording = read_log(log)
-    deadline = time.perf_counter() + 5.0
-    while not record.exists() and time.perf_counter() < deadline:
-        time.sleep(0.01)
+    try:
+        first = _first_line(log, victim)
+        time.sleep(max(0.0, first + moment - time.perf_counter()))
+    finally:  # also where Ctrl-C ends the drill: nobody writes into the folder after that
+        victim.kill()
+        killed = time.perf_counter()
+        victim.join()
+        while not record.exists() and time.perf_counter() < killed + 5.0:
+            time.sleep(0.01)
     time.sleep(0.01)
+    recording = read_log(log)
     facts = json.loads(record.read_text())
     return KillResult(
         killed - first,
