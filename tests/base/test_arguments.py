@@ -11,6 +11,7 @@ import enum
 import inspect
 import math
 from collections.abc import Callable, Iterator
+from fractions import Fraction
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ import sympy as sp
 from sympy.physics import mechanics
 
 import undertow as ut
-from undertow.base import InvalidInputError, ModelError, UndertowError
+from undertow.base import InvalidInputError, ModelError, UndertowError, checked
 from undertow.estimators import KalmanFilter
 
 #: What is given instead of each argument.
@@ -336,3 +337,18 @@ def test_a_mapping_is_told_by_its_keys_and_values(rig: ut.Mechanism) -> None:
     assert "in quotes" not in str(e.value)
     with pytest.raises(InvalidInputError, match=r"a sequence of names\. Write \['x'\]"):
         ut.modelling.from_urdf("<robot/>", actuated="x")
+
+
+@pytest.mark.parametrize("kind", [sp.Rational, Fraction, lambda a, b: np.float16(a / b)])
+def test_numbers_of_every_kind_are_floats_where_these_are_asked_for(kind: Any) -> None:
+    """Compiled code takes no fraction; half a precision rounds what is made of it."""
+
+    @checked
+    def told(span: float, *, part: float | None = None) -> list[type]:
+        return [type(span), type(part)]
+
+    number = kind(1, 4)
+    assert told(number, part=number) == told(part=number, span=number) == [float, float]
+    assert type(ut.Budget(8, seconds=number).seconds) is float
+    with pytest.raises(InvalidInputError, match=r"span of .*a number"):
+        told(10**400)

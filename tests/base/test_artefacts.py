@@ -15,6 +15,7 @@ from rich.text import Text
 
 from undertow.base import (
     as_text,
+    check_place,
     facts,
     file_name,
     finite,
@@ -28,6 +29,8 @@ from undertow.base import (
     write_files,
 )
 from undertow.base.errors import ArtefactError, InvalidInputError
+from undertow.cascade import Run
+from undertow.display.animation import Film
 
 
 def shown(*parts: RenderableType) -> list[str]:
@@ -137,3 +140,21 @@ def test_a_file_of_another_kind_is_refused_in_one_sentence(tmp_path: Path) -> No
         write_file(log, b"PAR1")
     assert str(caught.value).count("got ") == 1
     assert str(caught.value).endswith("Choose another name")
+
+
+def test_a_place_is_refused_before_what_is_written_there_is_made(tmp_path: Path) -> None:
+    """A folder, a name that is too long, a missing folder; a long name that is not is written."""
+    (tmp_path / "film.gif").mkdir()
+    for name in ("film.gif", f"{'n' * 252}.gif", "none/film.gif", "film.mp4"):
+        with pytest.raises(ArtefactError, match=r"Choose another folder or name|which is what"):
+            check_place(tmp_path / name, b"GIF8")
+    assert write_file(tmp_path / f"{'n' * 251}.gif", b"GIF89a").exists()
+
+
+def test_a_film_is_not_drawn_for_a_place_where_it_cannot_be(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(Film, "of", lambda *_, **__: pytest.fail("drawn"))
+    run = Run.__new__(Run)
+    with pytest.raises(ArtefactError, match="directory"):
+        run.animate(tmp_path)

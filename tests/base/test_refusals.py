@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import math
+import pickle
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, cast
@@ -18,6 +21,7 @@ from undertow.closed_loop.gate import broken_by
 from undertow.closed_loop.trajectory import Batch
 from undertow.models import TIME
 from undertow.optimiser.search import POLISH
+from undertow.plants import Bench, Friction
 from undertow.studies.motion import ended
 
 
@@ -156,3 +160,31 @@ def test_an_unstable_first_surface_is_refused(rig: ut.Mechanism) -> None:
     """(35) fails for λ_a > 0 at α_a = −1, and the message says so."""
     with pytest.raises(UnstableSurfaceError, match=r"\(35\)"):
         ut.Optimiser(ut.ClosedLoop(rig), first=ut.Surface(-1, 0.5, 5, 10))
+
+
+@pytest.mark.parametrize("kind", ["m8[s]", "M8[s]", "U8"])
+def test_times_and_texts_are_no_states(rig: ut.Mechanism, kind: str) -> None:
+    """NumPy makes floats of seconds since 1970, and of digits in quotes; SI units they are not."""
+    with pytest.raises(InvalidInputError, match="must be numbers"):
+        rig.check_state(np.zeros(4).astype("i8").astype(kind))
+
+
+def test_who_gives_or_takes_something_may_change_it_afterwards(rig: ut.Mechanism) -> None:
+    """What was checked is kept as a copy; what is handed out is the caller's own."""
+    tolerances, paths = {"m": 0.02}, dict(ut.Reference.sine(1.0, theta=0.1).paths)
+    friction = {"phi": Friction(coulomb=0.1)}
+    belief, reference = ut.Belief(rig, tolerances), ut.Reference(paths)
+    bench = Bench(rig, friction=friction)
+    tolerances["m"] = math.inf
+    paths["phi"] = friction["x"] = cast(Any, None)
+    assert belief.tolerances == {"m": 0.02}
+    assert list(reference.paths) == ["theta"]
+    assert list(bench.friction) == ["phi"]
+    for kept in (belief.tolerances, reference.paths, bench.friction, rig.start):
+        with pytest.raises(TypeError, match="does not support item assignment"):
+            cast(Any, kept)["m"] = 1.0
+    assert pickle.loads(pickle.dumps(belief)).tolerances == belief.tolerances
+    assert copy.deepcopy(bench).friction == bench.friction
+    M = rig.linearise().M
+    M[:] = math.nan
+    assert np.isfinite(rig.linearise().M).all()

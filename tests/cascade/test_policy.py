@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from typing import Any
 
 import numpy as np
@@ -116,3 +117,20 @@ def test_stable_baselines3_s_loop_over_a_vector_balances() -> None:
 def test_bad_arguments_are_refused(made: Any, said: str) -> None:
     with pytest.raises(InvalidInputError, match=said):
         made()
+
+
+def test_a_policy_keeps_what_it_saw_where_the_observation_s_array_is_used_again() -> None:
+    """Environments with ``copy=False`` fill the same array; what is learnt is about what was."""
+    cascade = ut.Cascade(RIG, GOAL, belief="exact", cold=ut.Budget(64), warm=ut.Budget(64))
+    seen = RIG.state(phi=0.1)
+    _, (episode,) = ut.policy(cascade).predict(seen)
+    seen[:] = np.nan
+    (kept,) = vars(episode)["_x"]
+    assert (kept == RIG.state(phi=0.1)).all()
+
+
+def test_policies_can_be_pickled() -> None:
+    act = ut.policy(ut.ClosedLoop(RIG, GOAL), SURFACE)
+    x = RIG.state(phi=0.1)
+    again = pickle.loads(pickle.dumps(act))
+    assert (again.predict(x)[0] == act.predict(x)[0]).all()

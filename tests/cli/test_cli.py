@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import errno
+import io
 import json
 import os
 import re
@@ -22,7 +24,7 @@ from typer.main import get_command
 import undertow as ut
 from runs import run
 from undertow.base import ArtefactError, InvalidInputError, write_file
-from undertow.cli import _ORDER, _place, app
+from undertow.cli import _ORDER, _place, app, main, terminal
 from undertow.cli.parsing import (
     aimed,
     mechanism_named,
@@ -633,3 +635,49 @@ def test_no_output_at_all_is_none() -> None:
     ended = _typed("--version", preexec_fn=lambda: os.close(1))
     assert ended.returncode == 0
     assert ended.stderr == b""
+
+
+def test_streams_that_are_closed_are_nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python has ``None`` in their place, and whatever asked them something failed."""
+    for name in ("stdin", "stderr"):
+        monkeypatch.setattr(sys, name, None)
+    monkeypatch.setattr(sys, "argv", ["undertow", "--version"])
+    monkeypatch.setenv("COLUMNS", "0")  # nothing would be shown
+    with pytest.raises(SystemExit) as left:
+        main()
+    assert left.value.code == 0
+    assert "COLUMNS" not in os.environ
+    assert sys.stderr.writable()
+    assert not sys.stdin.isatty()
+    for stream in (sys.stdin, sys.stderr):
+        stream.close()
+
+
+def test_help_on_a_full_disk_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+
+    class Full(io.StringIO):
+        def write(self, _: str) -> int:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(sys, "stdout", Full())
+    monkeypatch.setattr(sys, "argv", ["undertow", "simulate", "--help"])
+    with pytest.raises(SystemExit) as left:
+        main()
+    assert left.value.code == 1
+    assert capsys.readouterr().err.startswith("error: the output: got No space left on device")
+
+
+def test_what_was_found_is_shown_where_it_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a search of minutes a full disk left nothing of it."""
+
+    def full(*_: object) -> None:
+        raise ArtefactError("results", value="No space left on device")
+
+    monkeypatch.setattr(terminal, "write_files", full)
+    code, out, err = run("optimise", RIG, "--evaluations", "64", "--out", str(tmp_path))
+    assert (code, err.splitlines()[-1]) == (1, "error: results: got No space left on device.")
+    assert "predicted cost" in out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import math
 import os
@@ -16,6 +17,7 @@ import numba
 import numpy as np
 import pytest
 import sympy as sp
+from numba.core.caching import IndexDataCacheFile
 
 import undertow as ut
 from support import (
@@ -27,6 +29,7 @@ from support import (
     rest_slow,
     runge_kutta,
 )
+from undertow.base import ArtefactError
 from undertow.closed_loop.kernel import build_loop_graph
 from undertow.closed_loop.kernel_source import _hoist, kernel_source
 from undertow.law import Switching
@@ -248,6 +251,52 @@ def test_a_damaged_file_is_written_again(folder: Path) -> None:
     assert path.read_text(encoding="utf-8") == source
 
 
+def test_a_full_disk_is_told_and_leaves_no_half_file(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(ArtefactError, match=r"No space left.*UNDERTOW_CACHE=FOLDER"):
+        store.load_module("full", f"value = {os.getpid()}.75\n")
+    assert not list(folder.iterdir())
+
+
+COMPILED = """from undertow.symbolic.machine import compiled
+@compiled()
+def half(x):
+    return 0.5 * x
+"""
+
+
+@pytest.mark.parametrize("kept", ["nbi", "nbc"])
+def test_machine_code_that_is_cut_off_is_compiled_again(folder: Path, kept: str) -> None:
+    """A disk that was full, a power that was lost; numba ended every later start."""
+
+    def again() -> Path:
+        module = store.load_module("cut", COMPILED)
+        del sys.modules[module.__name__]
+        assert module.half(3.0) == 1.5
+        (path,) = folder.rglob(f"*.{kept}")
+        return path
+
+    path = again()
+    whole = path.read_bytes()
+    path.write_bytes(whole[:20])
+    assert len(again().read_bytes()) == len(whole)
+
+
+def test_machine_code_that_finds_no_room_is_used_all_the_same(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(IndexDataCacheFile, "save", full)
+    assert store.load_module("room", f"# {os.getpid()}\n{COMPILED}").half(3.0) == 1.5
+
+
 def test_a_folder_that_cannot_be_made_is_no_obstacle(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -279,9 +328,11 @@ def test_changed_numbers_need_no_new_kernel_and_changed_formulas_do(rig: ut.Mech
 
 
 SOURCE_HASH = """
+import errno
 import hashlib
 import undertow as ut
 from undertow.closed_loop.kernel_source import kernel_source
+from undertow.base import ArtefactError
 from undertow.closed_loop.kernel import build_loop_graph
 rig = ut.mechanisms.rotary_pendulum()
 program = build_loop_graph(rig, rig.with_parameters(m=0.2), ut.MinimumEnergy(), "saturation")

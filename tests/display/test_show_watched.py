@@ -27,6 +27,7 @@ from undertow.runtime import (
     about,
 )
 from undertow.studies.live import Watched, of_log
+from undertow.studies.live.window import Window
 
 COLUMNS = Columns.of(RECIPE.belief)
 
@@ -196,3 +197,19 @@ def test_a_run_is_watched_from_another_process(tmp_path: Path) -> None:
     assert "Verdict: " in printed
     assert process.returncode in (0, 3, 6)  # held: settled or not, and on a machine that is busy
     assert "identical" in run("replay", str(tmp_path / "run.db"), "--no-decisions")[1]
+
+
+def test_a_window_begins_beside_a_stranger_and_a_lost_one_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A signal.py in the working directory ended its process, and the run without a word."""
+    (tmp_path / "signal.py").write_text("raise SystemExit")
+    monkeypatch.chdir(tmp_path)
+    with Window() as window:
+        process = vars(window)["_process"]
+        process.join(1.0)
+        assert process.exitcode is None
+        process.kill()
+        process.join()
+        with pytest.raises(ArtefactError, match="its process has ended"):
+            window.open(tmp_path / "run.db")

@@ -294,3 +294,10 @@ def test_errors_of_state_and_surface_come_in_pairs_of_one_size(belief: Belief) -
     assert not alpha_a.any()
     for block in others:
         assert (np.abs(block[1 : 1 + SLIPS]) == SLIP_OF_SURFACE).all()
+
+
+@pytest.mark.parametrize("t", [[0.1, 0.0], [0.0, math.nan]])
+def test_nothing_is_learnt_from_rows_out_of_order(t: list[float]) -> None:
+    belief = Belief.relative(ut.mechanisms.rotary_pendulum(), m=0.2)
+    with pytest.raises(InvalidInputError, match="times of a motion to learn from"):
+        belief.learn(belief.prior, t, np.zeros((2, 4)), np.zeros((2, 1)))

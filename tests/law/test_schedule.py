@@ -144,7 +144,7 @@ def test_times_begin_at_zero_and_rise(times: tuple[float, ...], good: bool) -> N
     if good:
         assert Plan(surfaces, times).times == times
     else:
-        with pytest.raises(InvalidInputError, match="times of a plan"):
+        with pytest.raises(InvalidInputError, match=r"(times|surfaces) of a plan"):
             Plan(surfaces, times)
 
 
@@ -166,3 +166,14 @@ def test_what_is_no_plan_is_refused(what: str) -> None:
     with pytest.raises(InvalidInputError, match=message) as caught:
         attempt()
     assert caught.value.limit is not None
+
+
+def test_a_plan_keeps_tuples_of_its_own() -> None:
+    """Lists and arrays could be changed after they were checked, and have no hash."""
+    surface, times = ut.Surface(-1, -0.5, 5, 10), np.array([0.0, 0.1])
+    plan = ut.Plan([surface, surface], times)  # type: ignore[arg-type]
+    times[:] = np.nan
+    assert plan == ut.Plan((surface, surface), (0.0, 0.1))
+    assert hash(plan) == hash(ut.Plan((surface, surface), (0.0, 0.1)))
+    with pytest.raises(InvalidInputError, match=r"one undertow\.Surface or more"):
+        ut.Plan(())

@@ -814,3 +814,8 @@ def test_a_driver_that_fails_says_where(tmp_path: Path) -> None:
 def test_a_wrong_name_of_the_library_lists_the_near_ones() -> None:
     with pytest.raises(InvalidInputError, match="Did you mean rotary_pendulum"):
         named("rotary_pendlum")
+
+
+def test_a_file_that_is_missing_is_told_in_words(tmp_path: Path) -> None:
+    with pytest.raises(ArtefactError, match=r"got no such file or directory, must be a file that"):
+        modelling.mechanism_from_file(f"{tmp_path}/bar.py:bar")

@@ -369,3 +369,10 @@ def test_a_delay_is_shared_out_and_nothing_is_lost(arm: ut.Mechanism) -> None:
     assert timing.input_delay + timing.measurement_delay == pytest.approx(0.005, rel=1e-15)
     assert min(timing.input_delay, timing.measurement_delay) > 0
     assert timing.period == 0.002
+
+
+@pytest.mark.parametrize("u", [[1.0, 2.0], "a", None, [math.nan]])
+def test_what_is_no_input_is_refused_by_a_rig(u: Any) -> None:
+    rig = ut.mechanisms.rotary_pendulum()
+    with pytest.raises(InvalidInputError, match=r"input written to a rig.*finite numbers"):
+        IdealRig(rig, rig.state(phi=0.1)).write(u)

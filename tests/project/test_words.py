@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import ctypes
 import io
 import json
 import math
@@ -11,6 +12,7 @@ import pickle
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +27,7 @@ from typer.testing import CliRunner
 import undertow as ut
 from runs import run
 from support import interpreted
-from undertow.base import InvalidInputError, UndertowError
+from undertow.base import InvalidInputError, UndertowError, interruptible
 from undertow.bounds import bound
 from undertow.cascade import (
     Admission,
@@ -618,6 +620,32 @@ def test_ctrl_c_at_any_moment_is_one_line(moment: str) -> None:
     assert code == 130
     assert said[-1].startswith("interrupted")
     assert not any("Traceback" in line for line in said)
+
+
+def test_ctrl_c_that_meets_a_function_which_c_calls_is_not_lost(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Compilers call Python: what they miss afterwards is no error of theirs."""
+    call = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))
+
+    def compile_something(*_: Any, **__: Any) -> None:
+        call()
+        raise RuntimeError("no compiled object yet")
+
+    @interruptible()
+    def pass_it_over() -> None:
+        call()
+        time.sleep(10)
+
+    monkeypatch.setattr(survey, "survey_one", compile_something)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        code, _, err = run("survey", "--only", "tora", "--no-bounds")
+        with pytest.raises(KeyboardInterrupt):
+            pass_it_over()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert (code, err.splitlines()[-1]) == (130, "interrupted")
 
 
 def test_an_interrupted_survey_keeps_its_rows(

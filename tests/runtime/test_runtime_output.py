@@ -217,6 +217,7 @@ def test_whatever_ends_the_loop_the_output_comes_to_zero_within_its_slew(
     assert report.verdict.ending in (("caught", "degraded") if survives else ("stopped",))
     if isinstance(error, KeyboardInterrupt):
         assert report.stopped_by == "operator: interrupt"
+        assert report.interrupted
 
 
 def test_a_zero_write_that_hangs_is_left_to_the_watchdog(controller: Controller) -> None:
@@ -755,6 +756,7 @@ def test_a_second_signal_ends_a_rig_that_never_returns(call: str) -> None:
         assert time.monotonic() - began < 15.0
         over.set()
         asking.join()
+    assert runtime.report.interrupted
     if call == "write":
         assert verdict.exit_code == EXIT_CODES["output on"]
     else:

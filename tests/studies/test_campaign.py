@@ -41,6 +41,7 @@ from undertow.studies.campaign.figures import (
     picture_file,
     proved_set,
 )
+from undertow.studies.campaign.report import tables as tables_of
 from undertow.studies.campaign.run import study_of
 from undertow.studies.survey import survey
 
@@ -318,6 +319,9 @@ def test_damaged_chunks_are_found_and_computed_again(
     path = tmp_path / "store"
     run(MAP, path)
     spoil(path, how)
+    for look in (picture, tables_of):
+        with pytest.raises(ArtefactError, match=r"Go on with --resume"):
+            look(Campaign(MAP, path))
     outcome = resumed(path)
     assert outcome.repaired == [2, 4]
     assert (outcome.computed, outcome.complete) == (3, True)

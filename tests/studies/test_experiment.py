@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import multiprocessing
+import os
 from collections.abc import Callable
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -142,6 +144,20 @@ def test_what_was_finished_before_a_task_failed_is_kept(tmp_path: Path) -> None:
         work.run(ledger)
     assert list(work.finished(ledger)) == [("square", k) for k in range(7)]
     assert work.ledger(tmp_path).known == ledger.known
+
+
+def test_a_disk_that_is_full_is_told_with_the_ledger(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    work = squares(3, [])
+    ledger = work.ledger(tmp_path)
+
+    def full(*_: Any, **__: Any) -> Any:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # of a write: without a name
+
+    monkeypatch.setattr(Path, "open", full)
+    with pytest.raises(ArtefactError, match=r"squares\.jsonl': got No space left.*same command"):
+        work.run(ledger)
 
 
 def test_few_tasks_are_under_way_and_what_waits_is_cancelled() -> None:

@@ -12,9 +12,11 @@ import pytest
 import undertow as ut
 from undertow.cascade import CascadeState
 from undertow.law import Plan
+from undertow.models import FloatArray
 from undertow.plants import IdealRig
 from undertow.runtime import Columns, InlineWorker, Recipe, Runtime, SimulatedClock, respond
 from undertow.runtime.recording import read_log
+from undertow.studies.fault_injection import live
 from undertow.studies.fault_injection.cases import CASES, Case, OutputMonitor
 from undertow.studies.fault_injection.live import (
     LIVE,
@@ -68,6 +70,42 @@ def test_a_fault_ends_as_it_should(part: str, name: str, tmp_path: Path) -> None
     assert outcome.passed, outcome.happened
     if not outcome.case.holds:
         assert outcome.after <= 1.2
+
+
+def test_ctrl_c_ends_the_drill_and_is_no_fault_of_its_list(tmp_path: Path) -> None:
+    """A run takes it for its operator's stop; what the run is a part of has to end as well."""
+
+    def interrupted(_: FloatArray) -> FloatArray:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        short(Case("loop", "Ctrl-C", False, estimator=interrupted), tmp_path)
+
+
+def test_ctrl_c_ends_what_a_drill_was_about_to_kill(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It ran on for a minute, and the drill waited for it."""
+
+    class Victim:
+        ended = 0
+
+        def kill(self) -> None:
+            self.ended += 1
+            (tmp_path / "supervisor.json").touch()  # as its rig's process does, which is not killed
+
+        def join(self) -> None:
+            self.ended += 1
+
+    def interrupted(*_: object) -> float:
+        raise KeyboardInterrupt
+
+    victim = Victim()
+    monkeypatch.setattr(live, "fork", lambda *_, **__: victim)
+    monkeypatch.setattr(live, "_first_line", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        live.kill_run(RECIPE, 0.1, tmp_path)
+    assert victim.ended == 2
 
 
 def test_the_list_is_long_and_covers_every_part() -> None:

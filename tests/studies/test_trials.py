@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,10 +20,11 @@ from undertow.estimators import Record
 from undertow.models.importers import holding_input
 from undertow.objective import objective_for
 from undertow.plants import Bench, Friction, Push, srv02_rig
+from undertow.runtime import Report
 from undertow.runtime.controller_defaults import estimator_for
 from undertow.studies.experiment import grouped
 from undertow.studies.ledger import Ledger
-from undertow.studies.trials import robustness
+from undertow.studies.trials import library, robustness
 from undertow.studies.trials.balance import Balance, controllers
 from undertow.studies.trials.estimation import EstimatorRow
 from undertow.studies.trials.report import (
@@ -189,6 +192,14 @@ def test_what_breaks_a_controller_is_the_change_that_is_named(
     found = robustness.broken_by("anybody", factor)
     assert found.survived <= limit < found.broken
     assert found.broken - found.survived == pytest.approx(largest / 32)
+
+
+def test_a_run_that_ctrl_c_stopped_is_not_counted_as_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor kept as a row of the table: the same command does it again."""
+    runtime = SimpleNamespace(run=lambda _: Report(stopped_by="operator: stop", interrupted=True))
+    monkeypatch.setattr(library, "session", lambda *_, **__: nullcontext(runtime))
+    with pytest.raises(KeyboardInterrupt):
+        library.through_the_runtime("rotary_pendulum", seeds=1)
 
 
 def test_all_controllers_meet_the_same_random_rigs(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,6 @@
 """What every other package stands on: checks of arguments, errors, verdicts, files and tables."""
 
-from undertow.base.interrupt import INTERRUPTED, at_once, by_exception
+from undertow.base.interrupt import INTERRUPTED, at_once, by_exception, interruptible
 
 at_once()
 
@@ -17,11 +17,13 @@ from undertow.base.arguments import (
     one_for_each,
     one_of,
     positive,
+    read_only,
     require,
 )
 from undertow.base.artefacts import (
     as_text,
     check_folder,
+    check_place,
     check_replaces,
     facts,
     file_name,
@@ -80,6 +82,7 @@ __all__ = [
     "check_fields",
     "check_file",
     "check_folder",
+    "check_place",
     "check_replaces",
     "checked",
     "duration",
@@ -90,6 +93,7 @@ __all__ = [
     "file_name",
     "finite",
     "floats",
+    "interruptible",
     "inward",
     "manifest",
     "mark",
@@ -104,6 +108,7 @@ __all__ = [
     "printable",
     "raised_at",
     "read_file",
+    "read_only",
     "require",
     "require_extra",
     "table",

@@ -7,13 +7,25 @@ All public functions use them: :func:`checked` reads the annotations of a functi
 from __future__ import annotations
 
 import contextlib
+import copyreg
 import inspect
 import math
+import sys
 import types
 from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import cache, wraps
 from numbers import Complex, Real
-from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Any,
+    Literal,
+    ParamSpec,
+    TypeVar,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 import sympy as sp
@@ -45,11 +57,16 @@ REMEDIES = {
     "Proposal": "Take the one that Cascade.propose returned",
 }
 
+#: What compiled code takes for a number, and where there is none.
+_PLAIN = (float, int, types.NoneType)
+
 #: What stands for a number that is written in full, and the most of a value that is shown.
 _ARRAY, _SHOWN = "array", 80
 
 P = ParamSpec("P")
 R = TypeVar("R")
+K = TypeVar("K")
+V = TypeVar("V")
 
 
 #: What helps who gives states of another kind or size.
@@ -77,6 +94,8 @@ def floats(what: str, values: ArrayLike, remedy: str = BY_NAME) -> np.typing.NDA
 def checked(function: Callable[P, R]) -> Callable[P, R]:
     """Have every argument of a function or method checked against its annotation.
 
+    Numbers of SymPy and of other kinds become floats where these are asked for.
+
     Raises
     ------
     InvalidInputError
@@ -103,20 +122,33 @@ Give a number in SI units: undertow.deg(10) for an angle of 10°
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        tests, last = _tests(function), len(places)
+        tests, last, floating = _tests(function), len(places), _floating(function)
+        given: Any = args
         for k, value in enumerate(args):
             parameter = places[k] if k < last else rest
             test = tests.get(parameter)
             if test is not None and not test(value):
                 _refuse(function, parameter, value, "" if k < last else f"{k - last}")
+            if type(value) not in _PLAIN and parameter in floating:
+                given = (*given[:k], float(cast(float, value)), *given[k + 1 :])
         for name, value in kwargs.items():
             parameter = name if name in words else others
             test = tests.get(parameter)
             if test is not None and not test(value):
                 _refuse(function, parameter, value, name)
-        return function(*args, **kwargs)  # of a missing or an unknown name Python itself tells
+            if type(value) not in _PLAIN and parameter in floating:
+                kwargs[name] = float(cast(float, value))
+        return function(*given, **kwargs)  # of a missing or an unknown name Python itself tells
 
     return call
+
+
+def read_only(mapping: Mapping[K, V]) -> types.MappingProxyType[K, V]:
+    """Return a copy of a mapping that nobody can write to; it can be pickled and copied."""
+    return types.MappingProxyType(dict(mapping))
+
+
+copyreg.pickle(types.MappingProxyType, lambda view: (read_only, (dict(view),)))
 
 
 def require(
@@ -239,6 +271,8 @@ def one_of(
 def check_fields(instance: Any, *names: str) -> None:
     """Check the fields of a dataclass, all or those named, against their annotations.
 
+    As in :func:`checked` numbers become floats where these are asked for.
+
     Raises
     ------
     InvalidInputError
@@ -250,6 +284,8 @@ def check_fields(instance: Any, *names: str) -> None:
         value = getattr(instance, name)
         if not tests[name](value):
             _refuse(owner, name, value)
+        if type(value) not in _PLAIN and name in _floating(owner):
+            object.__setattr__(instance, name, float(value))
 
 
 @cache
@@ -274,6 +310,12 @@ def _hints(of: Any) -> dict[str, Any]:
 def _tests(of: Any) -> dict[str | None, Callable[[Any], bool]]:
     """Return the test of each annotation, by the name of what it annotates."""
     return {name: _test(hint) for name, hint in _hints(of).items()}
+
+
+@cache
+def _floating(of: Any) -> frozenset[str | None]:
+    """Return the names whose annotation is a float, or none."""
+    return frozenset(n for n, hint in _hints(of).items() if hint in (float, float | None))
 
 
 def _refuse(of: Any, parameter: str | None, value: object, name: str = "") -> None:
@@ -393,8 +435,8 @@ def _is_array(value: Any) -> bool:
         return False
     try:
         given = np.asarray(value)  # of a complex number the imaginary part would be dropped
-        return given.dtype.kind != "c" and np.asarray(given, dtype=np.float64) is not None
-    except (TypeError, ValueError):
+        return given.dtype.kind in "biufO" and np.asarray(given, dtype=np.float64) is not None
+    except (TypeError, ValueError, OverflowError):
         return False
 
 
@@ -421,4 +463,6 @@ def _is_number(value: Any, hint: type) -> bool:
         return False
     if hint is int:
         return isinstance(value, Real) and bool(value == value // 1)
+    if isinstance(value, int) and value.bit_length() >= sys.float_info.max_exp:
+        return False  # more digits than a float has
     return isinstance(value, Complex if hint is complex else Real)

@@ -8,6 +8,7 @@ inside the folder, so no result is lost.  Figures are saved by
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import json
 import math
@@ -15,6 +16,7 @@ import os
 import platform
 import re
 import tempfile
+import threading
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import metadata
@@ -30,6 +32,9 @@ if TYPE_CHECKING:  # Rich takes time to import, which a table is worth and an im
 
 #: What pictures are written: how their names end, by how their contents begin.
 PICTURES = {b"\x89PNG": ".png", b"GIF8": ".gif"}
+
+#: What a file has to be, and what to do where it is not.
+_WRITABLE = "a file that can be written", "Choose another folder or name"
 
 PACKAGES = ("undertow", "numpy", "scipy", "sympy", "numba", "matplotlib", "casadi")
 
@@ -218,7 +223,8 @@ def check_folder(folder: Path) -> None:
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
     """Give a place to write to; what is there at the end becomes the file, or nothing does."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    # Without the file's name, which may be as long as names can be.
+    temporary = path.with_name(f".{os.getpid()}.{threading.get_ident()}.tmp")
     try:
         yield temporary
         temporary.replace(path)
@@ -249,6 +255,30 @@ def check_replaces(path: Path, begins: bytes) -> None:
         )
 
 
+def check_place(path: Path, begins: bytes) -> None:
+    """Prove that a file that begins so can be written at a place, before any long work.
+
+    Raises
+    ------
+    ArtefactError
+        As for :func:`write_file`.
+    """
+    kind = next((end for begin, end in PICTURES.items() if begins.startswith(begin)), "")
+    if kind and path.suffix and path.suffix.lower() != kind:
+        raise ArtefactError(
+            f"picture '{path}'",
+            value=f"a name that ends in {path.suffix}",
+            limit=f"one in {kind}, which is what is written",
+            remedy=f"Name it {path.with_suffix(kind)}",
+        )
+    with or_refused(f"file '{path}'", *_WRITABLE):
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        check_replaces(path, begins)
+        if path.is_file() or not path.exists():
+            tempfile.TemporaryFile(dir=path.resolve().parent).close()
+
+
 def write_file(path: Path, content: bytes) -> Path:
     """Write one file, whole or not at all, in place of an earlier one; return where it is.
 
@@ -258,18 +288,8 @@ def write_file(path: Path, content: bytes) -> Path:
         When it cannot be written, where a file of another kind is there, and for a picture whose
         name ends as that of another kind.
     """
-    kind = next((end for begin, end in PICTURES.items() if content.startswith(begin)), "")
-    if kind and path.suffix and path.suffix.lower() != kind:
-        raise ArtefactError(
-            f"picture '{path}'",
-            value=f"a name that ends in {path.suffix}",
-            limit=f"one in {kind}, which is what is written",
-            remedy=f"Name it {path.with_suffix(kind)}",
-        )
-    refusal = "a file that can be written", "Choose another folder or name"
-    with or_refused(f"file '{path}'", *refusal):
-        length = 1 if content.startswith(b"{") else 4  # JSON may be laid out in several ways
-        check_replaces(path, content[:length])
+    check_place(path, content[: 1 if content.startswith(b"{") else 4])  # JSON's layouts differ
+    with or_refused(f"file '{path}'", *_WRITABLE):
         if path.exists() and not path.is_file():  # a device or a pipe
             path.write_bytes(content)
         else:

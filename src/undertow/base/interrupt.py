@@ -1,4 +1,4 @@
-"""Ctrl-C in the command line's first second: one line, no traceback.
+"""Ctrl-C in the command line: one line, no traceback, in its first second and in a compiler.
 
 Importing takes a second, in which an exception may surface anywhere in other people's modules.
 While nothing is under way yet there is nothing to clean up: the process says so and ends.
@@ -9,11 +9,17 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from contextlib import suppress
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from types import FrameType
+from typing import Any
 
 #: Exit status of a command that Ctrl-C ended, as shells have it.
 INTERRUPTED = 130
+
+#: After which a Ctrl-C that was swallowed comes again, s.
+AGAIN = 0.2
 
 
 def _leave(_signal: int, _frame: FrameType | None) -> None:
@@ -41,3 +47,36 @@ def by_exception() -> None:
     """Let Ctrl-C be Python's own KeyboardInterrupt again: commands clean up after themselves."""
     if signal.getsignal(signal.SIGINT) is _leave:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Let Ctrl-C end what is done in it, also where it meets a function that C calls.
+
+    Python looks for Ctrl-C between two of its own steps; while a compiler works the next one is in
+    a function that the compiler calls, through which no exception can pass: Python passes it over.
+    What then fails for want of what that function should have done has been interrupted; where
+    nothing fails, Ctrl-C comes again.
+    """
+    again: list[threading.Timer] = []
+    before = sys.unraisablehook
+
+    def note(met: Any) -> None:
+        if met.exc_type is not KeyboardInterrupt:
+            before(met)
+        elif not (again and again[-1].is_alive()):
+            again.append(threading.Timer(AGAIN, signal.raise_signal, [signal.SIGINT]))
+            again[-1].daemon = True
+            again[-1].start()
+
+    sys.unraisablehook = note
+    try:
+        yield
+    except Exception:
+        if again:
+            raise KeyboardInterrupt from None
+        raise
+    finally:
+        sys.unraisablehook = before
+        for timer in again:
+            timer.cancel()

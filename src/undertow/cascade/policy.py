@@ -7,6 +7,7 @@ goes in and out as ``state``, one entry for each episode, as that of a recurrent
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -84,7 +85,7 @@ class Policy:
             Where a cascade that begins finds no admissible surface.
         """
         del deterministic
-        x = self.mechanism.check_state(observation)
+        x = np.array(self.mechanism.check_state(observation))  # who observes may reuse the array
         rows = np.atleast_2d(x)
         begins = np.atleast_1d(np.asarray(False if episode_start is None else episode_start))
         if rows.ndim != 2 or begins.shape not in ((1,), (len(rows),)):
@@ -240,8 +241,8 @@ def policy(
                 limit=f"a whole part of the cascade's, {cascade.period:g} s",
                 remedy="Change one of them",
             )
-        return Policy(mechanism, lambda: _CascadeEpisode(cascade, period), period)
+        return Policy(mechanism, partial(_CascadeEpisode, cascade, period), period)
     assert isinstance(controller, ClosedLoop)  # no cascade
     assert surfaces is not None  # no cascade
-    loop, plan = controller, Plan.of(surfaces)
-    return Policy(mechanism, lambda: _PlanEpisode(loop, plan, period), period)
+    begin = partial(_PlanEpisode, controller, Plan.of(surfaces), period)
+    return Policy(mechanism, begin, period)

@@ -19,7 +19,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from undertow.base import InvalidInputError, Verdict, at_least, checked, positive, write_file
+from undertow.base import (
+    InvalidInputError,
+    Verdict,
+    at_least,
+    check_place,
+    checked,
+    positive,
+    write_file,
+)
 from undertow.cascade.targets import legs_of
 from undertow.closed_loop import ROUNDING, ClosedLoop, Event, Trajectory, simulate_along
 from undertow.closed_loop.gate import Admission
@@ -161,6 +169,7 @@ class Run:
                 "figure of an animation", value=repr(figure), limit="an undertow.display Sketch"
             )
 
+        check_place(Path(path), b"GIF8")
         film = Film.of(self.trajectory, fps=fps, longest=longest, speed=speed, figure=figure)
         return write_file(Path(path), gif(film))
 

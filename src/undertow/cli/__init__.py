@@ -8,13 +8,14 @@ done in :mod:`undertow.studies` and below.
 from __future__ import annotations
 
 import io
+import os
 import sys
 from contextlib import suppress
 from typing import Annotated
 
 import typer
 
-from undertow.base import INTERRUPTED, at_once, by_exception, versions
+from undertow.base import INTERRUPTED, at_once, versions
 from undertow.cli import (  # noqa: F401 - each registers its commands
     bench,
     campaign,
@@ -28,7 +29,7 @@ from undertow.cli import (  # noqa: F401 - each registers its commands
     show,
     trials,
 )
-from undertow.cli.terminal import app, folded
+from undertow.cli.terminal import app, folded, say_unwritten
 
 __all__ = ["app", "main"]
 
@@ -75,15 +76,22 @@ def root(
 
 def main() -> None:
     """Run the command line."""
+    if os.environ.get("COLUMNS") == "0":  # of a terminal whose width is not known
+        del os.environ["COLUMNS"]
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:  # closed by who started it: no file may come in its place
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # what a terminal cannot show costs no result
             stream.reconfigure(errors="replace")
     try:
-        by_exception()
         app(prog_name="undertow")
-    except KeyboardInterrupt:  # before a command begins, which says so itself
+    except KeyboardInterrupt:  # after a command, which says so itself
         sys.stderr.write("interrupted\n")
         raise SystemExit(INTERRUPTED) from None
+    except OSError as error:  # in a help or before a command, which says so itself
+        say_unwritten(error)
+        raise SystemExit(1) from None
     finally:  # what is left is to end
         # An interrupt that met somebody's exec() stays marked as unhandled, and Python would end
         # by the signal instead of the exit status.  The next exec unmarks it.

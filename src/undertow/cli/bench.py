@@ -89,8 +89,9 @@ def bench(
                 learn=not quick,
                 progress=progress,
             )
-    written = write(out, lambda: files(request, belief, rest, found))
-    show(findings_table(found))
+    table = findings_table(found)
+    written = write(out, lambda: files(request, belief, rest, found), table)
+    show(table)
     if found.identification is not None:
         show(Group("", parameter_table(found.identification)))
     show(*summary(found), *written)

@@ -147,7 +147,7 @@ def certify(
                 progress=progress,
             )  # fmt: skip
             certified, report = (one,), certification.subject_report(mechanism, one)
-        written = write(out, lambda: _files(mechanism, certified, progress))
+        written = write(out, lambda: _files(mechanism, certified, progress), report, least=80)
     show(report, *written, least=80)
     proved = [{c.kind for c in item.subject.claims} for item in certified]
     exit_unless(all("stability" in kinds for kinds in proved))

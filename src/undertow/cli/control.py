@@ -142,9 +142,9 @@ def simulate(
                 given = found.surface or given
         check_surface(belief, given, x0)
         motion, surfaces = ClosedLoop(belief, goal, plant=truth).simulate(x0, given), (given,)
-    written = write(out, lambda: motion_files(request, motion, motion.cost, surfaces, run))
     words = ", ".join(target or ())
     said = motion_report(belief, goal, x0, motion, surfaces[0], run, cascade, goes_to, words)
+    written = write(out, lambda: motion_files(request, motion, motion.cost, surfaces, run), said)
     show(said, *written)
     exit_unless(motion.event.name == "REACHED")
 
@@ -195,5 +195,5 @@ def optimise(
     with progress_bar() as progress:
         progress("searching for the best surface", 0.0)
         proposal = optimiser.require(x0)
-    written = write(out, lambda: proposal_files(request, proposal))
-    show(proposal_report(belief, goal, x0, proposal), *written)
+    said = proposal_report(belief, goal, x0, proposal)
+    show(said, *write(out, lambda: proposal_files(request, proposal), said))

@@ -358,8 +358,8 @@ def replay(
 
         return pictures(result.recording)
 
-    written = write(out, pictures)
-    show(runs.replay_table(result), *written)
+    table = runs.replay_table(result)
+    show(table, *write(out, pictures, table))
     exit_unless(result.identical and result.gap is None)
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from undertow.base import InvalidInputError, check_folder, require_extra, write_file
+from undertow.base import InvalidInputError, check_folder, check_place, require_extra, write_file
 from undertow.cli import options
 from undertow.cli.parsing import mechanism_named, parse_start
 from undertow.cli.terminal import command, progress_bar
@@ -110,6 +110,7 @@ def show(
         require_extra("websockets", "show", "the live page needs websockets")
     else:
         check_folder(save.parent)
+        check_place(save, b"<!do")
     log = _is_log(name)
     if mechanism is not None and not log:
         raise InvalidInputError(

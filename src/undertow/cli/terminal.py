@@ -21,10 +21,13 @@ from typer.core import TyperCommand, TyperGroup
 
 from undertow.base import (
     INTERRUPTED,
+    ArtefactError,
     Progress,
     UndertowError,
+    by_exception,
     check_folder,
     duration,
+    interruptible,
     near,
     printable,
     write_files,
@@ -164,7 +167,9 @@ def _with_errors_in_one_line(function: Callable[P, None]) -> Callable[P, None]:
     @wraps(function)
     def guarded(*args: P.args, **kwargs: P.kwargs) -> None:
         try:
-            function(*args, **kwargs)
+            by_exception()
+            with interruptible():
+                function(*args, **kwargs)
         except KeyboardInterrupt:
             typer.echo("interrupted", err=True)
             raise typer.Exit(INTERRUPTED) from None
@@ -174,11 +179,16 @@ def _with_errors_in_one_line(function: Callable[P, None]) -> Callable[P, None]:
         except BrokenPipeError:  # who read the output has gone
             raise
         except OSError as error:  # a full disk behind a redirection, a terminal that is closed
-            said, of = error.strerror or str(error), error.filename or "the output"
-            _say_error(f"{of}: got {said}, must be a file that can be written. Name another one")
+            say_unwritten(error)
             raise typer.Exit(1) from None
 
     return guarded
+
+
+def say_unwritten(error: OSError) -> None:
+    """Say that something cannot be written, in one line."""
+    said, of = error.strerror or str(error), error.filename or "the output"
+    _say_error(f"{of}: got {said}, must be a file that can be written. Name another one")
 
 
 def _say_error(text: str) -> None:
@@ -231,7 +241,7 @@ def progress_bar() -> Iterator[Progress]:
 def completed(work: Callable[[Progress], object], kept: Sized = (1,)) -> bool:
     """Work under a progress bar; false where Ctrl-C ended it and something is kept to be shown."""
     try:
-        with progress_bar() as progress:
+        with progress_bar() as progress, interruptible():
             work(progress)
     except KeyboardInterrupt:
         if not kept:
@@ -256,8 +266,9 @@ def carry_out(
     parts: list[RenderableType] = []
     if every or not work.whole:
         result = work.gather(found)
-        written = write(out, lambda: work.files(result))
-        parts = [*work.report(result), *written, *work.notes(result)]
+        said = [*work.report(result)]
+        written = write(out, lambda: work.files(result), *said, **how)
+        parts = [*said, *written, *work.notes(result)]
         if every and written and ledger.path is not None:
             ledger.path.unlink()
     if seed is not None:
@@ -289,14 +300,24 @@ def check_out(out: Path | None) -> None:
         check_folder(out)
 
 
-def write(out: Path | None, files: Callable[[], Mapping[str, bytes]]) -> tuple[str, ...]:
-    """Write results where a folder is named, and return the sentences that say where they are."""
+def write(
+    out: Path | None, files: Callable[[], Mapping[str, bytes]], *parts: RenderableType, **how: Any
+) -> tuple[str, ...]:
+    """Write results where a folder is named, and return the sentences that say where they are.
+
+    Where the disk refuses, ``parts`` are shown first, as :func:`show` does: what was found is not
+    lost.
+    """
     if out is None:
         return ()
     made = files()
     if not made:
         return ()
-    earlier = write_files(out, made)
+    try:
+        earlier = write_files(out, made)
+    except ArtefactError:
+        show(*parts, **how)
+        raise
     written = f"Written to {out}/: {', '.join(made)}"
     return (written,) if earlier is None else (f"Earlier results moved to {earlier}/", written)
 

@@ -34,6 +34,7 @@ from undertow.base import (
     one_for_each,
     one_of,
     positive,
+    read_only,
 )
 from undertow.closed_loop import Ensemble, Risk
 from undertow.law import LawLayout
@@ -189,8 +190,9 @@ class Belief:
     bound: float | tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        """Check names and numbers."""
+        """Check names and numbers, and keep a copy of the tolerances."""
         check_fields(self)
+        object.__setattr__(self, "tolerances", read_only(self.tolerances))
         one_of("risk of a belief", self.risk, get_args(Risk))
         positive("confidence of a belief", self.confidence, "1 is usual", zero=True)
         known = {p.name: p for p in self.mechanism.parameters}
@@ -413,6 +415,11 @@ class Belief:
         t, x, u
             Times, (N,), s; states, (N, 2n); inputs after the actuator, (N, m).  Between two rows
             the input runs straight from one to the other.
+
+        Raises
+        ------
+        InvalidInputError
+            For other shapes, and for times that fall or are no numbers.
         """
         motion = (
             floats("t of a motion", t), floats("x of a motion", x), floats("u of a motion", u)
@@ -424,6 +431,13 @@ class Belief:
                 "motion to learn from",
                 value=f"t, x, u of shapes {', '.join(str(part.shape) for part in motion)}",
                 limit=f"(N,), (N, {2 * mechanism.n}), (N, {mechanism.m})",
+            )
+        if not (np.diff(motion[0]) >= 0).all():
+            raise InvalidInputError(
+                "times of a motion to learn from",
+                value=f"{motion[0][0]:g} to {motion[0][-1]:g} s",
+                limit="numbers that do not fall",
+                remedy="Put the rows in the order in which they were",
             )
         if rows < 2 or not self.tolerances:
             return estimate

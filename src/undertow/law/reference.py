@@ -46,6 +46,7 @@ from undertow.base import (
     positive,
     raised_at,
     read_file,
+    read_only,
 )
 from undertow.models import (
     FloatArray,
@@ -421,8 +422,10 @@ class Reference:
     units: Mapping[str, str] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
-        """Refuse what is no function of time."""
+        """Refuse what is no function of time; keep copies."""
         check_fields(self)
+        for name in ("paths", "units"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
         positive("period of a reference, s", self.period, "0 never repeats", zero=True)
         if not self.paths:
             raise InvalidInputError(

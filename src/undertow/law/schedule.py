@@ -57,18 +57,21 @@ class Plan:
     reaching: tuple[ReachingLaw, ...] | None = None
 
     def __post_init__(self) -> None:
-        """Check lengths, times and shapes."""
+        """Check lengths, times and shapes; keep tuples."""
         check_fields(self)
+        object.__setattr__(self, "surfaces", tuple(self.surfaces))
+        object.__setattr__(self, "times", tuple(map(float, self.times)))
+        if self.reaching is not None:
+            object.__setattr__(self, "reaching", tuple(self.reaching))
         shapes = {(s.n, s.m) for s in self.surfaces if isinstance(s, Surface)}
-        if len(shapes) > 1 or not all(isinstance(s, Surface) for s in self.surfaces):
+        if len(shapes) != 1 or not all(isinstance(s, Surface) for s in self.surfaces):
             raise InvalidInputError(
                 "surfaces of a plan",
                 value=[type(s).__name__ for s in self.surfaces],
-                limit="undertow.Surface, all with the same n and m",
+                limit="one undertow.Surface or more, all with the same n and m",
                 remedy="Build each with undertow.Surface(alpha_a, lambda_a, alpha_u, lambda_u)",
             )
-        fits = self.surfaces and len(self.times) == len(self.surfaces)
-        if not (fits and rising_from_zero(self.times)):
+        if not (len(self.times) == len(self.surfaces) and rising_from_zero(self.times)):
             raise InvalidInputError(
                 "times of a plan",
                 value=list(self.times),

@@ -10,9 +10,9 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
@@ -28,6 +28,7 @@ from undertow.base import (
     floats,
     one_of,
     positive,
+    read_only,
 )
 from undertow.models.lagrange import derived
 from undertow.models.partition import Partition, compiled
@@ -200,15 +201,7 @@ class Mechanism:
         self._check()
         by_names(f"start of '{self.name}'", self.start)
         self.state(**self.start)
-        object.__setattr__(self, "start", MappingProxyType(dict(self.start)))
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Give the start as a dict: a view of one cannot be pickled."""
-        return vars(self) | {"start": dict(self.start)}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take it back as a view that nobody can write to."""
-        self.__dict__.update(state, start=MappingProxyType(state["start"]))
+        object.__setattr__(self, "start", read_only(self.start))
 
     def _check(self) -> None:
         data = vocabulary(parameters=self.parameters, time=False)
@@ -782,6 +775,7 @@ class Mechanism:
         """Linearise at the target x = 0: ẋ = A x + B u; ``.ss()`` is python-control's.
 
         u counts from the input that holds the target, ``undertow.modelling.holding_input``.
+        The arrays are the caller's own.
 
         Raises
         ------
@@ -790,7 +784,7 @@ class Mechanism:
         """
         from undertow.models.linearisation import linearise
 
-        return linearise(self)
+        return deepcopy(linearise(self))
 
     def energy(self, x: ArrayLike, t: float = 0.0) -> FloatArray:
         """Return T + V at the states x, (…,), J, at the time t, s.

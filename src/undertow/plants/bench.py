@@ -14,7 +14,15 @@ from typing import Any, Self
 
 import numpy as np
 
-from undertow.base import InvalidInputError, at_least, between, one_of, positive, require
+from undertow.base import (
+    InvalidInputError,
+    at_least,
+    between,
+    one_of,
+    positive,
+    read_only,
+    require,
+)
 from undertow.mechanisms import rotary_pendulum
 from undertow.models import FloatArray, Mechanism, Parameter
 
@@ -270,7 +278,10 @@ class Bench:
     source: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse names that the mechanism does not have."""
+        """Refuse names that the mechanism does not have; keep copies."""
+        for name, given in vars(self).items():
+            if isinstance(given, Mapping):
+                object.__setattr__(self, name, read_only(given))
         mechanism = self.mechanism
         coordinates = [c.name for c in mechanism.coordinates]
         for what, names, known in (

@@ -185,9 +185,18 @@ class RealisticRig:
         Raises
         ------
         InvalidInputError
-            For an input that is not a number: no amplifier has a voltage for that.
+            For an input that is not a number: no amplifier has a voltage for that; for another
+            shape.
         """
-        self._u[:] = u
+        try:
+            self._u[:] = u
+        except (TypeError, ValueError) as error:
+            raise InvalidInputError(
+                "input written to a rig",
+                value=repr(u),
+                limit=f"{len(self._u)} finite numbers",
+                remedy="Give one for each input, in its unit",
+            ) from error
         if not all(map(math.isfinite, self._u)):
             raise InvalidInputError(
                 "input written to a rig",

@@ -252,7 +252,7 @@ class Runtime:
         report, controller = self.report, self.controller
         reason = f"loop: {error_text(error)}"
         if isinstance(error, KeyboardInterrupt):
-            reason = "operator: interrupt"
+            reason, report.interrupted = "operator: interrupt", True
         if controller.mode is not Mode.SAFE_STOP:
             report.mode_before_stop = controller.mode
             controller.mode, controller.stopped_by = Mode.SAFE_STOP, reason

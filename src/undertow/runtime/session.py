@@ -339,6 +339,7 @@ class _StopSignals:
         """Handle a signal that asks for a stop."""
         self._asked = True
         if self.runtime is not None:
+            self.runtime.report.interrupted = True
             self.runtime.stop()
         if self._preparing or (self.runtime is not None and self.runtime.hangs):
             raise KeyboardInterrupt

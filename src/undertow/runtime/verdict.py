@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 
@@ -53,6 +53,8 @@ class Report:
         Steps that the lockstep check made again, and those in which its output was another.
     mode, stopped_by
         State at the end, and why the run stopped, if it did.
+    interrupted
+        Whether a signal stopped it, as Ctrl-C does.
     entered
         How often each state was entered.
     answers
@@ -96,6 +98,7 @@ class Report:
     lockstep_mismatches: int = 0
     mode: Mode = Mode.IDLE
     stopped_by: str = ""
+    interrupted: bool = False
     entered: Counter[str] = field(default_factory=Counter)
     answers: Counter[str] = field(default_factory=Counter)
     events: list[tuple[float, str, str]] = field(default_factory=list)
@@ -122,6 +125,18 @@ class Report:
         steps = f"{self.steps} steps, {self.missed_deadlines} missed"
         cost = f"cost {self.cost:.4g} {self.unit}".rstrip()
         return f"Report({self.verdict.ending}, {steps}, {cost})"
+
+    def unless_interrupted(self) -> Self:
+        """Return it; where a signal stopped the run, what the run is a part of ends, too.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            Then: a run that was stopped is no result.
+        """
+        if self.interrupted:
+            raise KeyboardInterrupt
+        return self
 
     @property
     def lost_rows(self) -> int:

@@ -14,6 +14,7 @@ from typing import Any, Generic, TypeVar, get_args, get_origin, get_type_hints
 import numpy as np
 
 from undertow.base import ArtefactError, error_text, parse_json, read_file, versions
+from undertow.base.errors import or_refused
 
 #: Largest ledger that is read, bytes.
 LARGEST = 1 << 28
@@ -80,7 +81,11 @@ class Ledger(Generic[V]):
 
     def _append(self, line: str) -> None:
         assert self.path is not None  # who asks has a file
-        with self.path.open("a", encoding="utf-8") as file:
+        refusal = "a file that can be written", "Free some space: the same command goes on there"
+        with (
+            or_refused(f"ledger '{self.path}'", *refusal),
+            self.path.open("a", encoding="utf-8") as file,
+        ):
             file.write(f"{line}\n")
 
 

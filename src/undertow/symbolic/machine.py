@@ -24,6 +24,7 @@ from __future__ import annotations
 import gc
 import os
 import platform
+from contextlib import nullcontext, suppress
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -120,16 +121,34 @@ def _model() -> str:
 
 
 def _loading(usual: Any) -> Any:
-    """Return how numba loads what it keeps, for our functions without what compiling needs."""
+    """Return how numba loads what it keeps, for our functions without what compiling needs.
+
+    What is damaged, by a full disk or a lost power, is not there.
+    """
 
     def load_overload(cache: Any, signature: Any, target: Any) -> Any:
         if not isinstance(cache._impl.locator, _PrivateLocator):
             return usual(cache, signature, target)
         rtsys.initialize(target)
-        with cache._guard_against_spurious_io_errors():
+        try:
             return cache._load_overload(signature, target)
+        except Exception:  # a pickle that is cut off may raise anything
+            with suppress(OSError):
+                cache.flush()
+            return None
 
     return load_overload
+
+
+def _saving(usual: Any) -> Any:
+    """Return how numba keeps what it compiles; a disk that refuses ours only costs time later."""
+
+    def save_overload(cache: Any, signature: Any, data: Any) -> None:
+        ours = isinstance(cache._impl.locator, _PrivateLocator)
+        with suppress(OSError) if ours else nullcontext():
+            usual(cache, signature, data)
+
+    return save_overload
 
 
 class _Sooner(event.Listener):  # type: ignore[misc]
@@ -176,6 +195,7 @@ _widen()
 _USUAL = functions.BaseFunction.get_call_type
 event.register("numba:compile", _Sooner())
 caching.Cache.load_overload = _loading(caching.Cache.load_overload)
+caching.Cache.save_overload = _saving(caching.Cache.save_overload)
 # The list is searched from its beginning; other people's functions pass ours by.
 (getattr(caching, "CacheImpl", None) or caching._CacheImpl)._locator_classes.insert(
     0, _PrivateLocator

@@ -23,6 +23,7 @@ from types import ModuleType
 import numpy as np
 import sympy as sp
 
+from undertow.base.errors import or_refused
 from undertow.symbolic.machine import PACKAGE, numba
 from undertow.symbolic.private import private_folder
 
@@ -107,15 +108,24 @@ def _seal(key: str, text: str) -> str:
 def _write(path: Path, text: str) -> None:
     """Write a file that appears whole or not at all."""
     handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
-    with os.fdopen(handle, "w", encoding="utf-8") as file:
-        file.write(text)
-    os.replace(temporary, path)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(text)
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise
 
 
 def load_module(name: str, source: str) -> ModuleType:
     """Import ``source`` from the cache, writing it first if it is new.
 
     The file appears whole or not at all, so several processes may ask at once.
+
+    Raises
+    ------
+    ArtefactError
+        When the disk refuses.
     """
     digest = hashlib.sha256((_versions() + source).encode()).hexdigest()[:16]
     module_name = f"{re.sub(r'[^A-Za-z0-9_]', '_', name)[:80]}_{digest}"
@@ -123,7 +133,9 @@ def load_module(name: str, source: str) -> ModuleType:
         return sys.modules[module_name]
     path = private_folder() / f"{module_name}.py"
     if not path.exists() or path.read_bytes() != source.encode():
-        _write(path, source)
+        limit, remedy = "one with room", "Free some space, or name another: UNDERTOW_CACHE=FOLDER"
+        with or_refused(f"folder of compiled code '{path.parent}'", limit, remedy):
+            _write(path, source)
     spec = importlib.util.spec_from_file_location(module_name, path)
     assert spec is not None  # a plain .py file always has a spec and a loader
     assert spec.loader is not None

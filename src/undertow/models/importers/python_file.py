@@ -17,8 +17,12 @@ from undertow.base import (
     error_text,
     near,
     raised_at,
+    read_file,
 )
 from undertow.models.mechanism import Mechanism
+
+#: Largest file that is run, bytes.
+LARGEST = 1 << 24
 
 
 def in_a_file(text: str) -> bool:
@@ -98,6 +102,7 @@ def named_in_file(
             limit="FILE.py:NAME",
             remedy=f"Check the path, and name the {what} after it, like my_file.py:my_{what}",
         )
+    source = read_file(path, f"{what} file", most=LARGEST)
     module = ModuleType(f"undertow_user_{what}")
     module.__file__ = str(path)
     sys.modules[module.__name__] = module  # dataclasses look there
@@ -107,7 +112,7 @@ def named_in_file(
     try:
         # Not by an import: that would take yesterday's bytecode for a file of the same size
         # and second, and a certificate is about the file as it stands.
-        exec(compile(path.read_bytes(), str(path), "exec"), vars(module))
+        exec(compile(source, str(path), "exec"), vars(module))
         if name not in vars(module):
             raise _nameless(vars(module), name, file, suits)
         return use(vars(module)[name])
@@ -123,7 +128,7 @@ def named_in_file(
             f"{what} file '{file}'",
             value=f"{error_text(error)}{raised_at(error, str(path))}",
             limit="a file that runs",
-            remedy="Run it by itself: python FILE.py" if path.is_file() else "Check the path",
+            remedy="Run it by itself: python FILE.py",
         ) from error
 
 

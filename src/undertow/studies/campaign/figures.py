@@ -23,6 +23,7 @@ from undertow.proofs.kernel.claims import SurfaceRegion
 from undertow.proofs.region.lyapunov import LyapunovFunction
 from undertow.studies.campaign.region_map import EVENTS, RegionMap
 from undertow.studies.campaign.run import Campaign
+from undertow.studies.campaign.store import loaded
 
 #: Most points of an axis that are drawn; a finer grid is thinned out.
 DRAWN = 600
@@ -60,9 +61,9 @@ def picture(campaign: Campaign, proved: Proved | None = None) -> Figure:
         surface, and a terminal set where those that stay as they are are not at the target.
     """
     study: Any = campaign.study
-    data = campaign.dataset().isel({
+    data = loaded(campaign.path, campaign.dataset().isel({
         axis.name: slice(None, None, -(-len(axis.values) // DRAWN)) for axis in study.axes
-    })  # fmt: skip
+    }))  # fmt: skip
     region = isinstance(study, RegionMap)
     if not (len(study.axes) == 2 or (region and len(study.axes) == 3)):
         raise InvalidInputError(

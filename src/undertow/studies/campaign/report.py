@@ -9,7 +9,7 @@ from rich.console import RenderableType
 
 from undertow.base import duration, number, table
 from undertow.studies.campaign.run import Campaign, CampaignResult, compute
-from undertow.studies.campaign.store import Store, digest
+from undertow.studies.campaign.store import Store, digest, loaded
 from undertow.studies.campaign.study import Arrays
 from undertow.symbolic import processor
 
@@ -76,7 +76,7 @@ def report(campaign: Campaign, outcome: CampaignResult) -> list[RenderableType]:
 
 def tables(campaign: Campaign) -> list[RenderableType]:
     """Return what the store has, of any version: the tables of its kind, or a summary."""
-    data = campaign.dataset()
+    data = loaded(campaign.path, campaign.dataset())
     return campaign.study.report(data) or [summary(campaign, data)]
 
 

@@ -259,6 +259,25 @@ def dataset(path: Path) -> Any:
     return xarray.open_zarr(str(path), consolidated=False).drop_vars(DONE)
 
 
+def loaded(path: Path, data: Any) -> Any:
+    """Return what was opened of a store, read into memory.
+
+    Raises
+    ------
+    ArtefactError
+        Where a chunk is damaged.
+    """
+    try:
+        return data.load()
+    except (OSError, ValueError, RuntimeError) as error:
+        raise ArtefactError(
+            f"store '{path}'",
+            value=printable(error_text(error))[:200],
+            limit="one whose chunks can be read",
+            remedy="Go on with --resume: what is damaged is computed again",
+        ) from error
+
+
 def unwritten(path: Path, error: OSError) -> ArtefactError:
     """Return the condition of a store that the system does not let us write."""
     return ArtefactError(

@@ -96,7 +96,7 @@ def _optimiser(number: signal.Signals) -> Happened:
     with session(recipe, rig=monitor, processes=2) as runtime:
         assert isinstance(runtime.worker, BackgroundWorker)
         threading.Timer(0.5, os.kill, (runtime.worker.processes[0], number)).start()
-        report = runtime.run(2.5)
+        report = runtime.run(2.5).unless_interrupted()
     gave_up = report.answers["never came"]
     later = [t for t, _, text in report.events if "applied" in text and t > 1.3]
     held = report.stopped_by == Reason.END.text and not monitor.faults
@@ -111,7 +111,7 @@ def _blocking_read() -> Happened:
     recipe = drill_recipe()
     rig = _Blocking(recipe.make_rig())
     with session(recipe, rig=rig, processes=1) as runtime:
-        report = runtime.run(2.0)
+        report = runtime.run(2.0).unless_interrupted()
     after = rig.let_go - rig.blocked
     happened = f"{report.stopped_by}; the rig was let go of after {1e3 * after:.0f} ms"
     return (happened, 0 < after < 0.5)
@@ -136,7 +136,7 @@ def _supervisor() -> Happened:
     recipe.make_rig().write(np.zeros(recipe.belief.m))
     rig = _StandsStill(SupervisedRig(recipe.make_rig, recipe.period, *recipe.output_bounds))
     with session(recipe, rig=rig, processes=1) as runtime:
-        report = runtime.run(2.0)
+        report = runtime.run(2.0).unless_interrupted()
     told = "supervisor does not answer" in report.stopped_by
     gone = not rig.process.is_alive()
     return (report.stopped_by, told and gone)
@@ -231,16 +231,17 @@ def kill_run(recipe: Recipe, moment: float, folder: Path) -> KillResult:
     """
     log, record = folder / "killed.db", folder / "supervisor.json"
     victim = fork(_victim, (recipe, log, record), "undertow victim", daemon=False)
-    first = _first_line(log, victim)
-    time.sleep(max(0.0, first + moment - time.perf_counter()))
-    victim.kill()
-    killed = time.perf_counter()
-    victim.join()
-    recording = read_log(log)
-    deadline = time.perf_counter() + 5.0
-    while not record.exists() and time.perf_counter() < deadline:
-        time.sleep(0.01)
+    try:
+        first = _first_line(log, victim)
+        time.sleep(max(0.0, first + moment - time.perf_counter()))
+    finally:  # also where Ctrl-C ends the drill: nobody writes into the folder after that
+        victim.kill()
+        killed = time.perf_counter()
+        victim.join()
+        while not record.exists() and time.perf_counter() < killed + 5.0:
+            time.sleep(0.01)
     time.sleep(0.01)
+    recording = read_log(log)
     facts = json.loads(record.read_text())
     return KillResult(
         killed - first,
@@ -312,7 +313,7 @@ class _Hungry(_Struck):
 def _starved(recipe: Recipe, record: Path) -> None:
     rig = _Hungry(recipe.make_rig())
     with session(recipe, rig=rig, processes=1) as runtime:
-        report = runtime.run(1.5)
+        report = runtime.run(1.5).unless_interrupted()
     verdict = report.verdict
     facts = {"text": str(verdict), "code": verdict.exit_code, "off": verdict.output_zero}
     record.write_text(json.dumps({**facts, "u": rig.u.tolist()}))

@@ -181,7 +181,7 @@ def run_case(
             worker.act = worker.waiting.clear
         if case.operator:
             worker.act = runtime.stop
-        report = runtime.run(seconds)
+        report = runtime.run(seconds).unless_interrupted()
     stopped = [t for t, what, text in report.events if what == "state" and "SAFE_STOP" in text]
     free = plant.truth[recipe.belief.m : recipe.belief.n]
     held = report.stopped_by == Reason.END.text

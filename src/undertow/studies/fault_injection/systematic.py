@@ -315,7 +315,7 @@ class Systematic:
             raise
         with book:
             runtime = Runtime(controller, monitor, worker, clock=SimulatedClock(), log=book)
-            run.report = runtime.run(SECONDS)
+            run.report = runtime.run(SECONDS).unless_interrupted()
         run.log_failure, run.unsound = book.failure, monitor.faults
 
     def _against_the_clock(self, name: str, run: _Run) -> None:
@@ -324,7 +324,7 @@ class Systematic:
         rig = self._rig(name, run.device, in_step=False)
         try:
             with session(recipe, rig=rig, log=run.log, processes=2) as runtime:
-                run.report = runtime.run(LIVE_SECONDS)
+                run.report = runtime.run(LIVE_SECONDS).unless_interrupted()
         finally:
             with contextlib.suppress(Exception):
                 rig.close()

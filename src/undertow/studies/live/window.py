@@ -5,6 +5,8 @@ from __future__ import annotations
 import multiprocessing
 import os
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Self
@@ -45,7 +47,8 @@ class Window:
         self._process = context.Process(
             target=_show, args=(theirs, mechanism), name="undertow show", daemon=True
         )
-        self._process.start()
+        with _safe_path():
+            self._process.start()
         theirs.close()
 
     def open(self, log: Path) -> str:
@@ -56,15 +59,13 @@ class Window:
         ArtefactError
             Where it cannot be shown.
         """
-        self._line.send(log)
         address, problem = None, "its process has ended"
-        if not self._line.poll(BEGIN):
-            problem = f"its process has not begun after {BEGIN:g} s"
-        else:
-            try:
+        with suppress(EOFError, OSError):  # then it has
+            self._line.send(log)
+            if self._line.poll(BEGIN):
                 address, problem = self._line.recv()
-            except EOFError:
-                address = None
+            else:
+                problem = f"its process has not begun after {BEGIN:g} s"
         if address is None:
             raise ArtefactError(
                 "page of a run", value=problem, limit="one that can be opened",
@@ -83,6 +84,23 @@ class Window:
             self._process.join(LINGER)
         self._process.terminate()
         self._process.join(LINGER)
+
+
+@contextmanager
+def _safe_path() -> Iterator[None]:
+    """Let Python begin without the working directory among its modules: a signal.py may lie there.
+
+    ``spawn`` starts ``python -c``, which looks there first.
+    """
+    name = "PYTHONSAFEPATH"
+    before = os.environ.get(name)
+    os.environ[name] = "1"
+    try:
+        yield
+    finally:
+        del os.environ[name]
+        if before is not None:
+            os.environ[name] = before
 
 
 def _show(line: Connection, mechanism: str | None) -> None:

@@ -41,7 +41,7 @@ def through_the_runtime(name: str, *, seeds: int) -> LibraryRow:
     for seed in range(seeds):
         recipe = Recipe(mechanism=name, rig="realistic", seed=seed, evaluations=BUDGET)
         with session(recipe, simulated=True) as runtime:
-            report = runtime.run(SECONDS)
+            report = runtime.run(SECONDS).unless_interrupted()
         if report.stopped_by != Reason.END.text:
             ends[report.stopped_by] += 1
             continue
