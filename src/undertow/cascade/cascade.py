@@ -108,7 +108,8 @@ class Cascade:
         and a plan that some plausible plant would not survive is replaced before its period ends.
         Least time is re-optimised for the estimate alone where states are exact, a schedule always,
         and later decisions mend that: one of :attr:`reserve` has to bring every plausible plant
-        home after a period.
+        home after a period.  The first of these decisions begins, too, with what the first search
+        found to be best for the estimate by then.
         ``"exact"``: the mechanism is taken for the plant, as in the paper.
     covariance
         Of the error of the estimated state at the target, (2n, 2n), SI units: predictions count the
