@@ -352,3 +352,6 @@ def test_numbers_of_every_kind_are_floats_where_these_are_asked_for(kind: Any) -
     assert type(ut.Budget(8, seconds=number).seconds) is float
     with pytest.raises(InvalidInputError, match=r"span of .*a number"):
         told(10**400)
+    with pytest.raises(InvalidInputError) as refusal:
+        told(np.zeros((3, 3)))  # type: ignore[arg-type]
+    assert "\n" not in str(refusal.value)

@@ -681,3 +681,10 @@ def test_what_was_found_is_shown_where_it_cannot_be_written(
     code, out, err = run("optimise", RIG, "--evaluations", "64", "--out", str(tmp_path))
     assert (code, err.splitlines()[-1]) == (1, "error: results: got No space left on device.")
     assert "predicted cost" in out
+
+
+def test_a_port_that_is_none_is_refused_before_the_page_is_made() -> None:
+    code, _, err = run("show", RIG, "--no-browser", "--port", "70000")
+    assert code == 2
+    assert "65535" in err
+    assert "making ready" not in err

@@ -339,7 +339,7 @@ def _refuse(of: Any, parameter: str | None, value: object, name: str = "") -> No
 
 
 def _shown(value: object) -> str:
-    text = repr(value)
+    text = " ".join(repr(value).split())
     text = text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
     return f"{text}, a {type(value).__name__}"
 

@@ -49,7 +49,7 @@ def _box(mechanism: Mechanism, within: list[str] | None) -> dict[str, tuple[floa
     "undertow certify cart_pendulum --seconds 30 --out proof",
     "undertow certify rotary_pendulum --run --start phi=40deg --set d_e=0.025 --out proof",
     "undertow certify rotary_pendulum --loop --seconds 0 --start phi=20deg --out proof",
-    "undertow certify tora --loop --seconds 0 --start theta=0.3rad --start x=0.12m --out proof",
+    "undertow certify tora --loop --seconds 0 --start theta=0.3rad --start x=0.02m --out proof",
     "undertow certify rotary_pendulum --loop --seconds 0 --start phi=10deg --hold 1",
     "undertow certify rotary_pendulum --loop --seconds 0 --start phi=5deg --hold 1 --within m=2",
     "undertow certify --appendix",

@@ -77,7 +77,7 @@ def show(
     setting: options.Settings = None,
     limit: options.Limits = None,
     period: float = 0.1,
-    port: int | None = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535)] = None,
     browser: bool = True,
     mechanism: str | None = None,
     save: Path | None = None,
