@@ -249,6 +249,43 @@ def test_a_bound_is_the_same_in_any_unit_of_cost(price: float) -> None:
     assert found[1].stationarity < 1e-6
 
 
+def test_a_bound_is_the_same_in_any_unit_of_the_input() -> None:
+    """In 2²⁰ N: unknowns are parts of the limits, and the search is the same."""
+    plant, unit = linear_plant(2.0), 2.0**20
+    large = replace(
+        plant, inputs=(replace(plant.inputs[0], limit=2.0 / unit),), input_matrix=[[unit]]
+    )
+    one, other = (
+        bound(m, ut.MinimumTime(horizon=9.0), [0.3, 0.2, 0.0, 0.0], intervals=10)
+        for m in (plant, large)
+    )
+    assert one.iterations == other.iterations
+    assert one.cost == pytest.approx(other.cost, rel=1e-10)
+    np.testing.assert_allclose(one.u, unit * other.u, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_inputs_of_very_different_limits_are_bounded() -> None:
+    """A cart of 30 N, and a wheel of 0.02 N m on the pendulum that it carries."""
+    x, w, p = ut.Coordinate("x", "m"), ut.Coordinate("w", "rad"), ut.Coordinate("p", "rad")
+    tip = x.velocity + sp.Float(0.4) * sp.cos(p.symbol) * p.velocity
+    fall = sp.Float(0.4) * sp.sin(p.symbol) * p.velocity
+    cart = ut.Mechanism.from_energies(
+        "cart_with_wheel",
+        [x, w, p],
+        [ut.Input("force", "N", 30.0), ut.Input("torque", "N m", 0.02)],
+        kinetic=x.velocity**2 / 2
+        + sp.Float(0.2) * (tip**2 + fall**2)
+        + sp.Float(0.005) * p.velocity**2
+        + sp.Float(0.002) * (p.velocity + w.velocity) ** 2,
+        potential=sp.Float(0.4 * 9.81 * 0.4) * sp.cos(p.symbol),
+    )
+    objective = ut.MinimumTime(horizon=10.0)
+    x0 = cart.state(p=0.08)
+    slides = ut.ClosedLoop(cart, objective).simulate(x0, ut.first_surface(cart))
+    assert 0.3 < bound(cart, objective, x0).cost < slides.time
+
+
 def test_double_integrator_takes_twice_the_root_of_distance_over_limit() -> None:
     """Minimum time of ẍ = u, |u| ≤ U from rest at d is 2√(d/U), bang-bang.
 

@@ -539,3 +539,10 @@ def test_weights_that_no_riccati_equation_bears_are_refused(rig: ut.Mechanism) -
 def test_poles_are_finite(rig: ut.Mechanism) -> None:
     with pytest.raises(InvalidInputError, match="3 finite numbers"):
         ut.placed_surface(rig, [-1.0, -2.0, -math.inf])
+
+
+def test_a_surface_shows_no_negative_zeros() -> None:
+    assert repr(ut.Surface(-np.eye(2), -np.eye(2), [[-0.8], [-0.0]], [[3.4], [0.0]])) == (
+        "Surface(alpha_a=[[-1.0, 0.0], [0.0, -1.0]], lambda_a=[[-1.0, 0.0], [0.0, -1.0]], "
+        "alpha_u=[[-0.8], [0.0]], lambda_u=[[3.4], [0.0]])"
+    )

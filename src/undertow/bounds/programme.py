@@ -126,6 +126,7 @@ class Programme:
         self.waits = not self.rest_costs or any(stage.diff(u).subs(target) != 0 for u in held)
         self.scale = time_scale(mechanism, longest)
         limits = np.where(np.isfinite(mechanism.input_limits), mechanism.input_limits, 1.0)
+        self.units = limits  # of the inputs as unknowns
         # ∫ effort dt weighs every input, from the one that holds the target, by its limit.
         effort = sum(((u - held[u]) / limit) ** 2 for u, limit in zip(held, limits, strict=True))
         margins = [w for m in objective.path_margins(mechanism) for w in smooth(m)]
@@ -159,14 +160,19 @@ class Programme:
         return ca.Function("interval", [t, h, a, c, b, u_a, u_b], outputs)
 
     def _transcribe(self, mesh: FloatArray, dynamics: Any) -> _Transcription:
-        """Write the programme on a mesh in [0, 1]; the final time is its last unknown."""
+        """Write the programme on a mesh in [0, 1]; the final time is its last unknown.
+
+        Inputs are in parts of their limits: whether N or mN, and which of them is small, must not
+        count.
+        """
         ca, n, m, count = self.ca, 2 * self.mechanism.n, self.mechanism.m, len(mesh) - 1
         x, c = ca.MX.sym("x", n, count + 1), ca.MX.sym("c", n, count)
         u, end = ca.MX.sym("u", m, count + 1), ca.MX.sym("t_f")
         starts, steps = ca.DM(mesh[:-1]).T * end, ca.DM(np.diff(mesh)).T * end
-        each = (starts, steps, x[:, :-1], c, x[:, 1:], u[:, :-1], u[:, 1:])
+        inputs = ca.DM(self.units) * u
+        each = (starts, steps, x[:, :-1], c, x[:, 1:], inputs[:, :-1], inputs[:, 1:])
         defects, costs, margins = self._interval(dynamics).map(count)(*each)
-        at_start = dynamics(0.0, x[:, 0], u[:, 0])[2]
+        at_start = dynamics(0.0, x[:, 0], inputs[:, 0])[2]
         reach = 1 - ca.sumsqr(x[:, -1]) / self.radius**2  # of order 1, as the tolerances expect
         return _Transcription(
             unknowns=ca.vertcat(ca.vec(x), ca.vec(c), ca.vec(u), end),
@@ -204,13 +210,15 @@ class Programme:
         else:
             shortest, longest = guess.time / QUICKER, min(QUICKER * guess.time, self.longest)
         end = min(max(guess.time, shortest), longest)
-        wide = np.concatenate([np.full(2 * n * count, np.inf), np.tile(limits, count + 1)])
+        wide = np.concatenate(
+            [np.full(2 * n * count, np.inf), np.tile(limits / self.units, count + 1)]
+        )
         lower = np.concatenate([self.x0, -wide, [shortest]])
         upper = np.concatenate([self.x0, wide, [longest]])
 
         middles = (mesh[:-1] + mesh[1:]) / 2
         first = [guess.x(mesh * end), guess.x(middles * end), guess.u(mesh * end)]
-        first[0][0], first[2] = self.x0, np.clip(first[2], -limits, limits)
+        first[0][0], first[2] = self.x0, np.clip(first[2], -limits, limits) / self.units
         scaling = 1.0 / self.unit if dynamics is self.cost else 1.0
         ipopt = {**_IPOPT, "max_iter": patience, "obj_scaling_factor": scaling}
         programme = {"x": written.unknowns, "f": written.cost, "g": constraints}
@@ -235,7 +243,11 @@ class Programme:
         nodes, centres, controls, last = np.split(
             solution, np.cumsum([n * (count + 1), n * count, m * (count + 1)])
         )
-        u, cost, iterations = controls.reshape(-1, m), float(found["f"]), statistics["iter_count"]
+        u, cost, iterations = (
+            controls.reshape(-1, m) * self.units,
+            float(found["f"]),
+            statistics["iter_count"],
+        )
         if dynamics is self.cost and report in _STATUS and 0 < cost < CHEAP * self.unit:
             self.unit = cost
             again = self.solve(mesh, guess, dynamics, fixed=fixed, patience=patience)

@@ -309,7 +309,7 @@ class Surface:
         def show(block: FloatArray) -> str:
             if block.size == 1:
                 return f"{block.item():.4g}"
-            return str([[float(f"{v:.4g}") for v in row] for row in block])
+            return str([[float(f"{v:.4g}") + 0.0 for v in row] for row in block])  # no -0.0
 
         return f"Surface({', '.join(f'{k}={show(b)}' for k, b in self._blocks._asdict().items())})"
 
