@@ -467,3 +467,18 @@ def test_a_state_beyond_a_constraint_is_planned_back(x_dot: float, farthest: flo
     assert admitted > 1
     assert abs(x[0]) < 0.3
     assert max(places) < farthest  # to go back it leans that way first
+
+
+@pytest.mark.parametrize("t", [math.nan, math.inf, -math.inf])
+def test_a_time_that_is_none_is_refused(rig: ut.Mechanism, t: float) -> None:
+    """A plan would begin then, and never go on to its next surface."""
+    cascade = ut.Cascade(rig, ut.MinimumTime(), belief="exact", cold=ut.Budget(64))
+    x = rig.state(phi=0.1)
+    state, _ = cascade.start(x)
+    for ask in (
+        lambda: cascade.start(x, t=t),
+        lambda: cascade.propose(state, x, t),
+        lambda: cascade.control(state, t, x),
+    ):
+        with pytest.raises(InvalidInputError, match=rf"time, s: got {t}"):
+            ask()

@@ -199,6 +199,20 @@ def between(
         raise InvalidInputError(what, value=got, limit=" to ".join(ends), remedy=remedy)
 
 
+def instant(t: float) -> None:
+    """Refuse a time that is not finite.
+
+    Raises
+    ------
+    InvalidInputError
+        With the value.
+    """
+    if not -math.inf < t < math.inf:
+        raise InvalidInputError(
+            "time, s", value=t, limit="a finite number", remedy="Give the clock's, s from the start"
+        )
+
+
 def positive(
     what: str, value: ArrayLike, remedy: str = "", *, zero: bool = False, infinite: bool = False
 ) -> None:

@@ -21,6 +21,7 @@ from undertow.base import (
     at_least,
     check_fields,
     checked,
+    instant,
     one_of,
     positive,
 )
@@ -377,7 +378,7 @@ class Cascade:
         InfeasibleError
             When no admissible surface was found.
         InvalidInputError
-            For a target that cannot be one, see :meth:`simulate`.
+            For a target that cannot be one, see :meth:`simulate`; a time that is not finite.
         """
         motion = None if target is None else self._target_at(target, t)
         return self.start_to(self.mechanism.check_state(x), motion, t)
@@ -435,6 +436,7 @@ class Cascade:
         The first plan is to arrive within ``longest``, s, where one does, else within the
         objective's horizon.
         """
+        instant(t)
         return first_plan(self._planners, self._judge, x, target, t, before, longest)
 
     @checked
@@ -454,6 +456,7 @@ class Cascade:
         way, too.  It follows the plan in use wherever x is: a target that jumps asks for
         :meth:`retarget`.
         """
+        instant(t)
         surface, law = state.plan.at(t - state.since)
         believed = self.believed(state)
         if state.target is not None:
@@ -504,6 +507,7 @@ class Cascade:
         it.  Of a target that moves, the search leaves the motion out: it sees the error, and the
         target at rest where it is at the time t.  :meth:`apply_gate` sees the motion.
         """
+        instant(t)
         return next_plan(self._planners, self._judge, self.resolution, state, x, t, horizon)
 
     @checked
