@@ -247,7 +247,7 @@ def _wrong(report: Report) -> Sequence[str]:
         ),
         (
             report.optimiser_failures > 0,
-            f"the optimiser could not be reached {report.optimiser_failures:,} ×",
+            f"{report.optimiser_failures:,} calls of the optimiser failed: it could not be reached",
         ),
         (report.failed_reads > FAILED * steps, f"{report.failed_reads:,} reads failed"),
         (report.failed_writes > FAILED * steps, f"{report.failed_writes:,} writes failed"),
