@@ -181,6 +181,7 @@ def test_a_loop_without_a_linear_model_arrives_about_as_early(other: dict[str, A
     assert found.cost <= 1.02 * usual.cost
 
 
+@pytest.mark.slow  # a kernel of its own
 def test_where_no_design_arrives_descents_from_draws_find_what_does() -> None:
     """A wheel that leans nearly as far as its voltage bears: these seeds found nothing without."""
     rig = ut.mechanisms.reaction_wheel_pendulum()

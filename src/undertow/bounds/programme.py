@@ -45,6 +45,10 @@ QUICKER, DEARER, SWINGING = 1.25, 1.05, 2.0
 #: Mean of (u_i/u_max,i)² below which a motion could clearly be run faster.
 IDLE = 0.05
 
+#: In which parts of its limit an input is an unknown: with whole limits, which are small beside
+#: states in rad and 1/s, the interior-point method loses its way to the acrobot's least time.
+PARTS = 10.0
+
 _IPOPT = {"print_level": 0, "sb": "yes", "tol": 1e-8}
 _STATUS: dict[str, Literal["optimal", "acceptable"]] = {
     "Solve_Succeeded": "optimal",
@@ -126,7 +130,7 @@ class Programme:
         self.waits = not self.rest_costs or any(stage.diff(u).subs(target) != 0 for u in held)
         self.scale = time_scale(mechanism, longest)
         limits = np.where(np.isfinite(mechanism.input_limits), mechanism.input_limits, 1.0)
-        self.units = limits  # of the inputs as unknowns
+        self.units = limits / PARTS  # of the inputs as unknowns
         # ∫ effort dt weighs every input, from the one that holds the target, by its limit.
         effort = sum(((u - held[u]) / limit) ** 2 for u, limit in zip(held, limits, strict=True))
         margins = [w for m in objective.path_margins(mechanism) for w in smooth(m)]
@@ -162,7 +166,7 @@ class Programme:
     def _transcribe(self, mesh: FloatArray, dynamics: Any) -> _Transcription:
         """Write the programme on a mesh in [0, 1]; the final time is its last unknown.
 
-        Inputs are in parts of their limits: whether N or mN, and which of them is small, must not
+        Inputs are in tenths of their limits: whether N or mN, and which of them is small, must not
         count.
         """
         ca, n, m, count = self.ca, 2 * self.mechanism.n, self.mechanism.m, len(mesh) - 1
