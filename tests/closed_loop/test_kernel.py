@@ -251,12 +251,14 @@ def test_a_damaged_file_is_written_again(folder: Path) -> None:
     assert path.read_text(encoding="utf-8") == source
 
 
+def full(*_: object) -> None:
+    """Answer as a full disk does."""
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
 def test_a_full_disk_is_told_and_leaves_no_half_file(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
     monkeypatch.setattr(os, "replace", full)
     with pytest.raises(ArtefactError, match=r"No space left.*UNDERTOW_CACHE=FOLDER"):
         store.load_module("full", f"value = {os.getpid()}.75\n")
@@ -290,9 +292,6 @@ def test_machine_code_that_is_cut_off_is_compiled_again(folder: Path, kept: str)
 def test_machine_code_that_finds_no_room_is_used_all_the_same(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
     monkeypatch.setattr(IndexDataCacheFile, "save", full)
     assert store.load_module("room", f"# {os.getpid()}\n{COMPILED}").half(3.0) == 1.5
 

@@ -207,10 +207,7 @@ def instant(t: float) -> None:
     InvalidInputError
         With the value.
     """
-    if not -math.inf < t < math.inf:
-        raise InvalidInputError(
-            "time, s", value=t, limit="a finite number", remedy="Give the clock's, s from the start"
-        )
+    require(math.isfinite(t), "time, s", t, "a finite number", "Give the clock's, s from the start")
 
 
 def positive(

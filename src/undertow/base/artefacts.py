@@ -263,6 +263,17 @@ def check_place(path: Path, begins: bytes) -> None:
     ArtefactError
         As for :func:`write_file`.
     """
+    _check_kind(path, begins)
+    with or_refused(f"file '{path}'", *_WRITABLE):
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        check_replaces(path, begins)
+        if path.is_file() or not path.exists():
+            tempfile.TemporaryFile(dir=path.resolve().parent).close()
+
+
+def _check_kind(path: Path, begins: bytes) -> None:
+    """Refuse a picture that begins so under a name that ends as that of another kind."""
     kind = next((end for begin, end in PICTURES.items() if begins.startswith(begin)), "")
     if kind and path.suffix and path.suffix.lower() != kind:
         raise ArtefactError(
@@ -271,12 +282,6 @@ def check_place(path: Path, begins: bytes) -> None:
             limit=f"one in {kind}, which is what is written",
             remedy=f"Name it {path.with_suffix(kind)}",
         )
-    with or_refused(f"file '{path}'", *_WRITABLE):
-        if path.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        check_replaces(path, begins)
-        if path.is_file() or not path.exists():
-            tempfile.TemporaryFile(dir=path.resolve().parent).close()
 
 
 def write_file(path: Path, content: bytes) -> Path:
@@ -288,8 +293,10 @@ def write_file(path: Path, content: bytes) -> Path:
         When it cannot be written, where a file of another kind is there, and for a picture whose
         name ends as that of another kind.
     """
-    check_place(path, content[: 1 if content.startswith(b"{") else 4])  # JSON's layouts differ
+    begins = content[: 1 if content.startswith(b"{") else 4]  # JSON may be laid out in several ways
+    _check_kind(path, begins)
     with or_refused(f"file '{path}'", *_WRITABLE):
+        check_replaces(path, begins)
         if path.exists() and not path.is_file():  # a device or a pipe
             path.write_bytes(content)
         else:
