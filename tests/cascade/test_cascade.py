@@ -445,6 +445,7 @@ def test_what_is_no_planner_or_no_verdict_of_a_gate_is_refused(rig: ut.Mechanism
         cascade.simulate(phi=0.2, duration=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("x_dot", "farthest"), [(0.0, 0.36), (0.4, 0.52)])
 def test_a_state_beyond_a_constraint_is_planned_back(x_dot: float, farthest: float) -> None:
     """As after a push on a rig: plans are admitted out there, and lead back inside."""

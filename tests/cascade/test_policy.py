@@ -12,7 +12,7 @@ import undertow as ut
 from undertow.base import InvalidInputError
 
 RIG = ut.mechanisms.rotary_pendulum()
-GOAL = ut.objective_for(RIG, "bench-energy", horizon=10.0)
+GOAL = ut.objective_for(RIG, "effort", horizon=10.0)
 SURFACE = ut.first_surface(RIG)
 FREE = RIG.with_input_limit(np.inf)
 

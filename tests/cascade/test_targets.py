@@ -241,7 +241,7 @@ def test_what_is_predicted_in_one_go_is_predicted_in_two(
     rig: ut.Mechanism, quick: ut.Surface, target: ut.Reference | None
 ) -> None:
     """Flows compose, whenever they begin; beside a target that moves, too."""
-    cascade = ut.Cascade(rig, ut.MinimumEnergy(), belief="exact")
+    cascade = ut.Cascade(rig, ut.objective_for(rig, "bench-energy"), belief="exact")
     motion = None if target is None else target.legs(rig, 4.0)[0][1]
     state, error = CascadeState(ut.Plan.of(quick), target=motion), rig.state(phi=0.2)
     halfway = cascade.predicted_error(state, error, 1.0, 1.2)

@@ -14,7 +14,6 @@ from undertow.models import FloatArray
 from undertow.optimiser.arrival import ArrivalSearch, _steps, closer
 
 RADIUS = 1e-3
-SLOW = pytest.mark.slow
 
 
 class Push:
@@ -156,17 +155,15 @@ def test_the_better_basin_is_found() -> None:
     assert last.cost < 1.15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "other",
     [
         pytest.param({"step": 0.001, "zoh_steps": 1}, id="held for 1 ms"),
-        pytest.param(
-            {"reaching": ut.ReachingLaw(switching="sign")}, id="discontinuous", marks=SLOW
-        ),
+        pytest.param({"reaching": ut.ReachingLaw(switching="sign")}, id="discontinuous"),
         pytest.param(
             {"plant": ut.mechanisms.rotary_pendulum(d_e=0.025).with_parameters(m=0.13)},
             id="on another plant",
-            marks=SLOW,
         ),
     ],
 )

@@ -86,10 +86,8 @@ def test_a_least_time_is_found_in_any_unit(rig: ut.Mechanism) -> None:
         assert found[2:] == pytest.approx(answers[0][2:], rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("name", "degrees", "radius"),
-    [("time", 23, 0.3), pytest.param("energy", 20, 0.01, marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "degrees", "radius"), [("time", 23, 0.3), ("energy", 20, 0.01)])
 def test_a_richer_set_of_variables_never_answers_worse(
     name: str, degrees: float, radius: float
 ) -> None:

@@ -44,7 +44,7 @@ Document = dict[str, Any]
 @pytest.fixture(scope="session")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The checker as the Makefile builds it, but for the time that optimising takes."""
-    return build(tmp_path_factory.mktemp("checker"), "OPTIMISE=-O1")
+    return build(tmp_path_factory.mktemp("checker"), "OPTIMISE=-Og")
 
 
 def build(folder: Path, *words: str) -> Path:
