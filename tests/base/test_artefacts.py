@@ -15,6 +15,7 @@ from rich.text import Text
 
 from undertow.base import (
     as_text,
+    check_folder,
     check_place,
     facts,
     file_name,
@@ -158,3 +159,8 @@ def test_a_film_is_not_drawn_for_a_place_where_it_cannot_be(
     run = Run.__new__(Run)
     with pytest.raises(ArtefactError, match="directory"):
         run.animate(tmp_path)
+
+
+def test_a_zero_byte_in_the_name_of_a_folder_is_said(tmp_path: Path) -> None:
+    with pytest.raises(ArtefactError, match="null byte"):
+        check_folder(tmp_path / "re\0sults")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import pickle
+import types
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, cast
@@ -184,6 +185,9 @@ def test_who_gives_or_takes_something_may_change_it_afterwards(rig: ut.Mechanism
         with pytest.raises(TypeError, match="does not support item assignment"):
             cast(Any, kept)["m"] = 1.0
     assert pickle.loads(pickle.dumps(belief)).tolerances == belief.tolerances
+    assert cast(Any, rig.start) | {"phi": 0.1} == {"phi": 0.1}
+    with pytest.raises(TypeError, match="mappingproxy"):  # another library's are its own
+        pickle.dumps(types.MappingProxyType({"m": 0.02}))
     assert copy.deepcopy(bench).friction == bench.friction
     M = rig.linearise().M
     M[:] = math.nan

@@ -483,3 +483,10 @@ def test_a_time_that_is_none_is_refused(rig: ut.Mechanism, t: float) -> None:
     ):
         with pytest.raises(InvalidInputError, match=rf"time, s: got {t}"):
             ask()
+
+
+def test_a_period_that_no_rollout_can_have_is_refused_for_that() -> None:
+    """It was taken, and the simulation then complained of the horizon."""
+    rig = ut.mechanisms.rotary_pendulum()
+    with pytest.raises(InvalidInputError, match=r"inner step, 0.002 s, up to 10000 s"):
+        ut.Cascade(rig, period=1e9)

@@ -121,7 +121,7 @@ def test_what_has_no_kinematics_gets_labelled_dials() -> None:
         potential=-(b.symbol**2) / 2,
     )  # fmt: skip
     parts = sketch_named("own.py:own", mechanism).parts
-    assert [part.text for part in parts if isinstance(part, Label)] == ["a, rad", "b, m"]
+    assert [part.text for part in parts if isinstance(part, Label)] == ["a, °", "b, m"]
     assert any(isinstance(part, Line) for part in parts)
 
 

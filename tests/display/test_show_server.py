@@ -226,6 +226,8 @@ def test_a_port_that_is_taken_is_said() -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
+        asked = CliRunner().invoke(app, ["show", "rotary_pendulum", "--port", str(port)])
+        assert (asked.exit_code, "making ready" in asked.output) == (1, False)  # before the work
         server = Server(Counting(), port)
         with pytest.raises(ArtefactError, match=f"port {port} of 127.0.0.1.*leave --port out"):
             asyncio.run(server.run(lambda _: None, asyncio.Event()))

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+import sympy as sp
 from scipy.integrate import solve_ivp
 
 import undertow as ut
@@ -16,6 +17,7 @@ from undertow.display.live import Message
 from undertow.display.sketches import sketch
 from undertow.runtime import Answer, InlineWorker, Request
 from undertow.studies.live import Simulation, of_run
+from undertow.studies.live.controls import controls_of
 from undertow.studies.live.planner import Task, cascade_for, planner
 
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.025)
@@ -309,6 +311,21 @@ def test_a_new_viewer_is_told_what_was(simulation: Simulation) -> None:
         "plant m",
     } <= {one["name"] for one in hello["controls"]}
     assert len(hello["frames"][0]["points"]) >= 2 * hello["count"]
+
+
+def test_sliders_go_no_farther_than_what_holds_the_target_and_count_every_input() -> None:
+    """A load of 2 kg on a hoist asks for 19.62 N; inputs in another order have friction, too."""
+    x, z, phi = ut.Coordinate("x", "m"), ut.Coordinate("z", "m"), ut.Coordinate("phi")
+    kinetic = x.velocity**2 + z.velocity**2 + phi.velocity**2 + x.velocity * phi.velocity / 2
+    hoist = ut.Mechanism.from_energies(
+        "hoist", [x, z, phi], [ut.Input("lift", "N", 40.0), ut.Input("pull", "N", 10.0)],
+        kinetic, 2 * 9.81 * z.symbol - sp.cos(phi.symbol), input_matrix=sp.Matrix([[0, 1], [1, 0]]),
+    )  # fmt: skip
+    controls = controls_of(hoist, "bench-energy", 0.1)
+    assert 2 * 9.81 < controls["limit lift"].low < controls["limit lift"].high
+    assert controls["limit pull"].low == pytest.approx(1.0)
+    assert controls["friction x"].high == pytest.approx(0.3 * 10.0)
+    assert controls["friction z"].high == pytest.approx(0.3 * 40.0)
 
 
 def test_a_mechanism_that_cannot_be_shown_is_refused_at_once() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -161,3 +162,8 @@ def test_a_loop_as_a_system_keeps_to_the_smaller_limit() -> None:
         assert abs(run.u).max() == 2.0
         found = moved(ut.nlsys(loop, SURFACE), run.t, run.x[0])
         np.testing.assert_allclose(found.states.T, run.x, atol=1e-6, rtol=0)
+
+
+def test_a_name_with_a_dot_is_a_system() -> None:
+    """python-control refuses such names, with a ValueError of its own."""
+    assert ut.nlsys(replace(ut.mechanisms.tora(), name="tora v0.2")).name == "tora v0_2"

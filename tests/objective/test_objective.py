@@ -118,8 +118,24 @@ def test_a_start_outside_is_refused_and_one_that_inputs_decide_is_not(rig: ut.Me
     with pytest.raises(InvalidInputError, match=r"\|phi\| ≤ 0.2.*-0\.1"):
         ut.MinimumTime(constraints=box).check_start(rig, rig.state(phi=0.3))
     ut.MinimumTime(constraints=box).check_start(rig, rig.state(phi=0.1))
-    power = ut.Constraint("power", lambda v: v.voltage * v.theta_dot + 1)
+    power = ut.Constraint("power", lambda v: (v.voltage + v.theta_dot) * v.theta_dot - 1)
     ut.MinimumTime(constraints=(power,)).check_start(rig, rig.state(theta_dot=2.0))
+
+
+def test_a_constraint_that_the_input_at_the_target_breaks_is_refused() -> None:
+    """What hangs on the input is held there by m g = 9.81 N: with less no motion ends there."""
+    x, phi = ut.Coordinate("x", "m"), ut.Coordinate("phi")
+    kinetic = x.velocity**2 / 2 + phi.velocity**2 / 2 + x.velocity * phi.velocity / 4
+    hoist = ut.Mechanism.from_energies(
+        "hoist", [x, phi], [ut.Input("force", "N", 20.0)], kinetic, 9.81 * x.symbol
+    )
+    weak, strong = (
+        ut.MinimumTime(constraints=(ut.Constraint("pull", pull),))
+        for pull in (lambda v: v.force - 9.0, lambda v: v.force - 10.0)
+    )
+    with pytest.raises(InvalidInputError, match=r"target x = 0.*'pull': got margin -0.81"):
+        weak.check_start(hoist, hoist.state(phi=0.1))
+    strong.check_start(hoist, hoist.state(phi=0.1))
 
 
 def test_a_start_where_a_constraint_is_no_number_is_refused(rig: ut.Mechanism) -> None:

@@ -606,3 +606,9 @@ def test_the_pictures_of_a_log_are_pictures(logged: Path) -> None:
     drawn = pictures(recording)
     assert set(drawn) == {"motion.png", "latency.png", "chatter.png"}
     assert all(content.startswith(b"\x89PNG") for content in drawn.values())
+
+
+def test_a_zero_byte_in_the_name_of_a_log_is_said(tmp_path: Path) -> None:
+    """It was a ValueError, after the first optimum."""
+    with pytest.raises(ArtefactError, match="a zero byte in its name"):
+        log_module.check_log(tmp_path / "run\0.db")

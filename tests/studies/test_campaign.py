@@ -41,6 +41,7 @@ from undertow.studies.campaign.figures import (
     picture_file,
     proved_set,
 )
+from undertow.studies.campaign.report import alone, status
 from undertow.studies.campaign.report import tables as tables_of
 from undertow.studies.campaign.run import study_of
 from undertow.studies.survey import survey
@@ -322,6 +323,12 @@ def test_damaged_chunks_are_found_and_computed_again(
     for look in (picture, tables_of):
         with pytest.raises(ArtefactError, match=r"Go on with --resume"):
             look(Campaign(MAP, path))
+    found = Campaign(MAP, path)
+    shards, damaged, missing = status(found)
+    assert f" {found.study.shards - 3} of {found.study.shards} shards" in shards
+    assert damaged.startswith("damaged: shards 2, 4; ")
+    assert missing == "not in it: 5"
+    assert "is damaged there" in alone(found, 4)[0]
     outcome = resumed(path)
     assert outcome.repaired == [2, 4]
     assert (outcome.computed, outcome.complete) == (3, True)

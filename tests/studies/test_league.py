@@ -23,6 +23,7 @@ from undertow.studies.campaign.definition import Settings
 from undertow.studies.campaign.entrants import FAULTS, ForfeitError, Refereed
 from undertow.studies.campaign.league import TASKS, League, home
 from undertow.studies.campaign.league_report import median_interval, tables, wilson
+from undertow.studies.campaign.report import alone
 from undertow.studies.campaign.run import study_of
 
 pytest.importorskip("zarr")
@@ -154,6 +155,15 @@ def test_what_an_entrant_does_wrong_costs_it_alone(file: Path) -> None:
         assert rows[name]["won"].item() == 0
     for name in ("Idle", "Huge"):  # no fault: the actuator has its limit, the pendulum falls
         assert (rows[name]["fault"].item(), rows[name]["won"].item()) == (0, 0)
+
+
+def test_a_shard_alone_says_why_runs_were_forfeited(file: Path, tmp_path: Path) -> None:
+    """What raised was told nowhere: whoever wrote it saw that it had raised, and no more."""
+    league = Campaign(entered(file, "Unmade", entrants=["lqr"], seconds=2.0), tmp_path / "store")
+    said = alone(league, league.study.axes[1].words.index("Unmade"))
+    line = OTHERS[: OTHERS.index("raise RuntimeError")].count("\n") + 1
+    words = f"forfeited: RuntimeError: not for this mechanism, {file} line {line}"
+    assert said[-1] == words
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ at_once()
 from undertow.base.arguments import (
     BY_NAME,
     REMEDIES,
+    ReadOnly,
     at_least,
     between,
     check_fields,
@@ -18,7 +19,6 @@ from undertow.base.arguments import (
     one_for_each,
     one_of,
     positive,
-    read_only,
     require,
 )
 from undertow.base.artefacts import (
@@ -70,6 +70,7 @@ __all__ = [
     "MissingExtraError",
     "ModelError",
     "Progress",
+    "ReadOnly",
     "ResourceError",
     "SingularSurfaceError",
     "UndertowError",
@@ -110,7 +111,6 @@ __all__ = [
     "printable",
     "raised_at",
     "read_file",
-    "read_only",
     "require",
     "require_extra",
     "table",

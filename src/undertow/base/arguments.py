@@ -7,12 +7,11 @@ All public functions use them: :func:`checked` reads the annotations of a functi
 from __future__ import annotations
 
 import contextlib
-import copyreg
 import inspect
 import math
 import sys
 import types
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import cache, wraps
 from numbers import Complex, Real
 from typing import (
@@ -143,12 +142,33 @@ Give a number in SI units: undertow.deg(10) for an angle of 10°
     return call
 
 
-def read_only(mapping: Mapping[K, V]) -> types.MappingProxyType[K, V]:
-    """Return a copy of a mapping that nobody can write to; it can be pickled and copied."""
-    return types.MappingProxyType(dict(mapping))
+class ReadOnly(Mapping[K, V]):
+    """A copy of a mapping that nobody can write to; it can be pickled and copied."""
 
+    __slots__ = ("_items",)
 
-copyreg.pickle(types.MappingProxyType, lambda view: (read_only, (dict(view),)))
+    def __init__(self, mapping: Mapping[K, V]) -> None:
+        self._items = dict(mapping)
+
+    def __getitem__(self, key: K) -> V:
+        """Return what stands under a key."""
+        return self._items[key]
+
+    def __iter__(self) -> Iterator[K]:
+        """Return the keys, in their order."""
+        return iter(self._items)
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self._items)
+
+    def __or__(self, other: Mapping[K, V]) -> dict[K, V]:
+        """Return a new dictionary with what is in either; the other counts."""
+        return self._items | dict(other)
+
+    def __repr__(self) -> str:
+        """Show what is in it."""
+        return repr(self._items)
 
 
 def require(

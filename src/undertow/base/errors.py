@@ -118,8 +118,8 @@ def or_refused(what: str, limit: str, remedy: str) -> Iterator[None]:
         yield
     except UndertowError:  # said already
         raise
-    except OSError as error:
-        said = error.strerror or str(error)
+    except (OSError, ValueError) as error:  # a ValueError: of a zero byte in a name
+        said = getattr(error, "strerror", None) or str(error)
         raise ArtefactError(what, value=said, limit=limit, remedy=remedy) from error
 
 

@@ -43,6 +43,7 @@ from undertow.cascade.state import CascadeState
 from undertow.cascade.targets import legs_of
 from undertow.closed_loop import RTOL, ClosedLoop, Event, Trajectory
 from undertow.closed_loop.gate import Admission, Gate, cost_gate
+from undertow.closed_loop.rollout import MOST_STEPS
 from undertow.estimators import Belief, Estimator, ParameterEstimate
 from undertow.law import (
     Control,
@@ -186,11 +187,12 @@ class Cascade:
         assert self.loop is not None  # built here, so that its checks run first
         stride = self.stride
         count = number_of("period of the cascade", self.period) / stride
-        if not (math.isfinite(count) and count > 0.5 and abs(count - round(count)) < 1e-6):
+        longest = 0.5 * MOST_STEPS * self.loop.step  # two of them are looked ahead
+        if not (count > 0.5 and self.period <= longest and abs(count - round(count)) < 1e-6):
             raise InvalidInputError(
                 "period of the cascade",
                 value=f"{self.period:g} s",
-                limit=f"a whole multiple of the inner step, {stride:g} s",
+                limit=f"a whole multiple of the inner step, {stride:g} s, up to {longest:g} s",
                 remedy="Change the period, or the step",
             )
         if any(abs(t / self.period - round(t / self.period)) > 1e-6 for t in self.freedom.times):

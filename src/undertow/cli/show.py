@@ -102,12 +102,13 @@ def show(
         Write one file that replays the log, or a simulated motion to the target, in any browser,
         and end.
     """
-    from undertow.display.live import saved_page, serve
+    from undertow.display.live import check_port, saved_page, serve
     from undertow.runtime import GrowingLog
     from undertow.studies import live
 
     if save is None:
         require_extra("websockets", "show", "the live page needs websockets")
+        check_port(port or 0)
     else:
         check_folder(save.parent)
         check_place(save, b"<!do")

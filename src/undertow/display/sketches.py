@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import sympy as sp
 
+from undertow.closed_loop.figures import display
 from undertow.models import Mechanism
 
 #: x, y, z as numbers or expressions, m.
@@ -122,7 +123,7 @@ def _dials(mechanism: Mechanism) -> Sketch:
         else:
             hand = (o + q, 0, 0)
             parts += [Line(((o - 1, 0, 0), (o + 1, 0, 0)), "frame"), Box(hand, 0.12, 0.12)]
-        labels.append(Label((o, 0, -1.1), f"{coordinate.name}, {coordinate.unit}"))
+        labels.append(Label((o, 0, -1.1), f"{coordinate.name}, {display(coordinate.unit)[1]}"))
     return Sketch((*parts, *labels), hand)
 
 

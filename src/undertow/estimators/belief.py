@@ -28,13 +28,13 @@ from numpy.typing import ArrayLike
 from undertow.base import (
     InvalidInputError,
     ModelError,
+    ReadOnly,
     check_fields,
     checked,
     floats,
     one_for_each,
     one_of,
     positive,
-    read_only,
 )
 from undertow.closed_loop import Ensemble, Risk
 from undertow.law import LawLayout
@@ -192,7 +192,7 @@ class Belief:
     def __post_init__(self) -> None:
         """Check names and numbers, and keep a copy of the tolerances."""
         check_fields(self)
-        object.__setattr__(self, "tolerances", read_only(self.tolerances))
+        object.__setattr__(self, "tolerances", ReadOnly(self.tolerances))
         one_of("risk of a belief", self.risk, get_args(Risk))
         positive("confidence of a belief", self.confidence, "1 is usual", zero=True)
         known = {p.name: p for p in self.mechanism.parameters}

@@ -74,7 +74,7 @@ def nlsys(what: Mechanism | ClosedLoop, surfaces: Surface | Plan | None = None) 
             states=what.state_names,
             inputs=[i.name for i in what.inputs],
             outputs=what.state_names,
-            name=what.name,
+            name=what.name.replace(".", "_"),  # python-control takes no dots
         )
     if loop.zoh_steps:
         raise InvalidInputError(
@@ -101,7 +101,7 @@ def nlsys(what: Mechanism | ClosedLoop, surfaces: Surface | Plan | None = None) 
         states=loop.mechanism.state_names,
         inputs=[f"{name}_disturbance" for name in names],
         outputs=[*loop.mechanism.state_names, *names],
-        name=f"{loop.truth.name}_loop",
+        name=f"{loop.truth.name}_loop".replace(".", "_"),
     )
 
 

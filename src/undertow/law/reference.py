@@ -37,6 +37,7 @@ from numpy.typing import ArrayLike
 
 from undertow.base import (
     InvalidInputError,
+    ReadOnly,
     UndertowError,
     check_fields,
     checked,
@@ -46,7 +47,6 @@ from undertow.base import (
     positive,
     raised_at,
     read_file,
-    read_only,
 )
 from undertow.models import (
     FloatArray,
@@ -425,7 +425,7 @@ class Reference:
         """Refuse what is no function of time; keep copies."""
         check_fields(self)
         for name in ("paths", "units"):
-            object.__setattr__(self, name, read_only(getattr(self, name)))
+            object.__setattr__(self, name, ReadOnly(getattr(self, name)))
         positive("period of a reference, s", self.period, "0 never repeats", zero=True)
         if not self.paths:
             raise InvalidInputError(

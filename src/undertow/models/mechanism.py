@@ -23,12 +23,12 @@ from undertow.base import (
     BY_NAME,
     InvalidInputError,
     ModelError,
+    ReadOnly,
     check_fields,
     checked,
     floats,
     one_of,
     positive,
-    read_only,
 )
 from undertow.models.lagrange import derived
 from undertow.models.partition import Partition, compiled
@@ -201,7 +201,7 @@ class Mechanism:
         self._check()
         by_names(f"start of '{self.name}'", self.start)
         self.state(**self.start)
-        object.__setattr__(self, "start", read_only(self.start))
+        object.__setattr__(self, "start", ReadOnly(self.start))
 
     def _check(self) -> None:
         data = vocabulary(parameters=self.parameters, time=False)

@@ -661,7 +661,7 @@ class Objective:
     def check_start(self, mechanism: Mechanism, x: FloatArray) -> None:
         """Refuse an initial state that breaks a path constraint, whatever the input does.
 
-        So is one that the target breaks, but for constraints on the input.
+        So is one that the target breaks, at rest there under the input that holds it.
 
         Parameters
         ----------
@@ -677,13 +677,14 @@ class Objective:
         """
         problem, start = self.on(mechanism), mechanism.check_state(x)
         margins = [*zip(problem.constraints, problem.path_margins(mechanism), strict=True)]
-        apart = [(c, w) for c, w in margins if not w.free_symbols & {*mechanism.u}]
-        for state, asked, which, remedy in (
-            (start, margins, "initial state", "Start inside the constraints, or widen them"),
-            (0 * start, apart, "target x = 0", "No motion may end there: widen the constraint"),
+        held = dict(zip(mechanism.u, holding_input(mechanism).tolist(), strict=True))
+        for state, u, which, remedy in (
+            (start, {}, "initial state", "Start inside the constraints, or widen them"),
+            (0 * start, held, "target x = 0", "No motion may end there: widen the constraint"),
         ):
-            values = mechanism.substitution | dict(zip(mechanism.x, state.tolist(), strict=True))
-            for constraint, margin in asked:
+            at = dict(zip(mechanism.x, state.tolist(), strict=True))
+            values = mechanism.substitution | at | u
+            for constraint, margin in margins:
                 found = margin.subs(values)
                 if not found.is_number:
                     continue  # it depends on the input

@@ -16,11 +16,11 @@ import numpy as np
 
 from undertow.base import (
     InvalidInputError,
+    ReadOnly,
     at_least,
     between,
     one_of,
     positive,
-    read_only,
     require,
 )
 from undertow.mechanisms import rotary_pendulum
@@ -281,7 +281,7 @@ class Bench:
         """Refuse names that the mechanism does not have; keep copies."""
         for name, given in vars(self).items():
             if isinstance(given, Mapping):
-                object.__setattr__(self, name, read_only(given))
+                object.__setattr__(self, name, ReadOnly(given))
         mechanism = self.mechanism
         coordinates = [c.name for c in mechanism.coordinates]
         for what, names, known in (

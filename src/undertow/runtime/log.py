@@ -328,6 +328,8 @@ def check_log(path: Path) -> None:
         When the log could not be made.
     """
     with _refused(path):
+        if "\0" in str(path):
+            raise OSError(errno.EINVAL, "a zero byte in its name")
         path.parent.mkdir(parents=True, exist_ok=True)
         if not os.access(path.parent, os.W_OK):
             raise PermissionError("its folder cannot be written")

@@ -6,6 +6,6 @@ cascade in real time and for the log of a run.
 
 from undertow.display.live.page import saved_page
 from undertow.display.live.scene import Grip, Scene
-from undertow.display.live.server import Message, Show, serve
+from undertow.display.live.server import Message, Show, check_port, serve
 
-__all__ = ["Grip", "Message", "Scene", "Show", "saved_page", "serve"]
+__all__ = ["Grip", "Message", "Scene", "Show", "check_port", "saved_page", "serve"]

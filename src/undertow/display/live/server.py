@@ -12,6 +12,7 @@ import asyncio
 import contextlib
 import secrets
 import signal
+import socket
 import time
 from collections import deque
 from collections.abc import Callable
@@ -81,8 +82,8 @@ class Show(Protocol):
 class Viewer:
     """Who looks on, and what waits to be sent there."""
 
-    def __init__(self, number: int, socket: Any) -> None:
-        self.number, self.socket = number, socket
+    def __init__(self, number: int, line: Any) -> None:
+        self.number, self.socket = number, line
         self.pictures: deque[Message] = deque(maxlen=PICTURES)
         self.others: deque[Message] = deque()
         self.missed = 0
@@ -187,12 +188,7 @@ class Server:
                 )  # fmt: skip
             except OSError as error:
                 if port == ports[-1]:
-                    raise ArtefactError(
-                        f"port {port} of {HOST}",
-                        value=(error.strerror or str(error)).lower(),
-                        limit="a free port",
-                        remedy="Another page may be open there; leave --port out for any free one",
-                    ) from error
+                    raise _taken(port, error) from error
         raise AssertionError("the last port returns or raises")
 
     def _answer(self, _connection: Any, request: Any) -> Any:
@@ -228,15 +224,15 @@ class Server:
         )
         return self._response(status.value, status.phrase, headers, data)
 
-    async def _talk(self, socket: Any) -> None:
+    async def _talk(self, line: Any) -> None:
         """Tell one viewer what there is to tell, and hear what it asks for."""
         self._count += 1
-        viewer = Viewer(self._count, socket)
+        viewer = Viewer(self._count, line)
         viewer.tell(self.show.hello())
         self.viewers[viewer.number] = viewer
         sender = asyncio.ensure_future(self._send(viewer))
         try:
-            async for text in socket:
+            async for text in line:
                 self._hear(viewer, text)
         except self._ws.exceptions.ConnectionClosed:
             pass
@@ -279,6 +275,29 @@ class Server:
                         viewer.cut_off()
             last = now
         await asyncio.sleep(FAREWELL)
+
+
+def check_port(port: int) -> None:
+    """Refuse a port of 127.0.0.1 that is taken, before any long work.
+
+    Raises
+    ------
+    ArtefactError
+        As for :func:`serve`.
+    """
+    try:
+        socket.create_server((HOST, port)).close()
+    except OSError as error:
+        raise _taken(port, error) from error
+
+
+def _taken(port: int, error: OSError) -> ArtefactError:
+    return ArtefactError(
+        f"port {port} of {HOST}",
+        value=(error.strerror or str(error)).lower(),
+        limit="a free port",
+        remedy="Another page may be open there; leave --port out for any free one",
+    )
 
 
 def serve(

@@ -11,7 +11,14 @@ from typing import Any, ClassVar, get_args
 import numpy as np
 from rich.console import RenderableType
 
-from undertow.base import InvalidInputError, MissingExtraError, UndertowError
+from undertow.base import (
+    InvalidInputError,
+    MissingExtraError,
+    UndertowError,
+    error_text,
+    printable,
+    raised_at,
+)
 from undertow.bounds import bound
 from undertow.mechanisms.named import named
 from undertow.models import FloatArray, Mechanism, linearise
@@ -209,8 +216,8 @@ class League(Study):
         except MissingExtraError:
             raise
         # Of somebody's code: it has no controller for this mechanism.
-        except (Exception, SystemExit):
-            return {"won": 0, "fault": 1}
+        except (Exception, SystemExit) as error:
+            return self._forfeit(ForfeitError(1, f"{error_text(error)}{raised_at(error)}"))
         referee: list[Refereed] = []
 
         def make(x0: FloatArray) -> Refereed:
@@ -227,10 +234,17 @@ class League(Study):
                 home=home(mechanism),
             )  # fmt: skip
         except ForfeitError as forfeit:
-            return {"won": 0, "fault": forfeit.fault}
+            return self._forfeit(forfeit)
         return _scores(mechanism, outcome) | dict(
             zip(("step_mean", "step_most"), spent(referee[0].seconds), strict=True)
         )
+
+    def _forfeit(self, forfeit: ForfeitError) -> dict[str, float]:
+        """Return the scores of a run that was given up, and note why."""
+        words = " ".join(f"forfeited: {forfeit}".split())
+        if words not in self.notes:
+            self.notes.append(printable(words))
+        return {"won": 0, "fault": forfeit.fault}
 
     def _hindsight(
         self, mechanism: Mechanism, objective: Objective, task: str, plant: int

@@ -93,7 +93,7 @@ def _scores(names: list[str], won: NDArray[Any], ratio: FloatArray, data: Any) -
         title=f"Entrants: {len(names)}. Mechanisms: {data.sizes['mechanism']}",
         note="cost: of won runs, over the plant's own bound: median, 95 % of it, worst\n"
         "step: processor time of a call, one a millisecond; mean, and the longest"
-        + (f"\nforfeited runs: {gave_none}" if gave_none else ""),
+        + (f"\nforfeited runs: {gave_none}; --shard says why" if gave_none else ""),
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from rich.console import RenderableType
 
 from undertow.base import duration, number, table
-from undertow.studies.campaign.run import Campaign, CampaignResult, compute
+from undertow.studies.campaign.run import Campaign, CampaignResult, compute, study_of
 from undertow.studies.campaign.store import Store, digest, loaded
 from undertow.studies.campaign.study import Arrays
 from undertow.symbolic import processor
@@ -18,15 +18,25 @@ LISTED = 8
 
 
 def status(campaign: Campaign) -> list[str]:
-    """Return how far a store is, and which shards it has not."""
-    marks = Store(campaign.path, campaign.key, campaign.about).marks()
+    """Return how far a store is, which shards it has not, and which are damaged."""
+    store = Store(campaign.path, campaign.key, campaign.about)
+    marks, damaged = store.marks(), store.damaged(campaign.study)
     missing = np.flatnonzero(marks == 0).tolist()
-    lines = [f"{campaign.path}: {len(marks) - len(missing)} of {len(marks)} shards"]
+    done = len(marks) - len(missing) - len(damaged)
+    lines = [f"{campaign.path}: {done} of {len(marks)} shards", *_damage(damaged)]
     return [*lines, f"not in it: {_listed(missing)}"] if missing else lines
+
+
+def _damage(shards: list[int]) -> list[str]:
+    """Say which shards are damaged, and what to do."""
+    words = f"damaged: shards {_listed(shards)}; --resume computes them again"
+    return [words] if shards else []
 
 
 def alone(campaign: Campaign, shard: int) -> list[str]:
     """Compute one shard in this process, and say whether the store has the same."""
+    study = study_of(campaign.definition)
+    study.notes.clear()
     arrays = compute(campaign.definition, shard)
     found = digest(campaign.study.same_bits(arrays))
     said = "there is no store"
@@ -34,12 +44,15 @@ def alone(campaign: Campaign, shard: int) -> list[str]:
         store = Store(campaign.path, campaign.key, campaign.about)
         mark = int(store.marks()[shard])
         said = "the same bits as in the store" if mark else "the store has it not"
-        if mark not in (0, found):
+        if mark == found and not store.has(campaign.study, shard, mark):
+            said = "the store had the same bits, but is damaged there: go on with --resume"
+        elif mark not in (0, found):
             said = f"the store has other bits: {_difference(campaign, store, shard, arrays)}"
     return [
         f"shard {shard} of {campaign.study.shards}, seed {campaign.study.seed}: "
         f"digest {found:016x}, {said}",
         *(f"  {name}: {_range(values)}" for name, values in arrays.items()),
+        *study.notes,
     ]
 
 
@@ -77,7 +90,8 @@ def report(campaign: Campaign, outcome: CampaignResult) -> list[RenderableType]:
 def tables(campaign: Campaign) -> list[RenderableType]:
     """Return what the store has, of any version: the tables of its kind, or a summary."""
     data = loaded(campaign.path, campaign.dataset())
-    return campaign.study.report(data) or [summary(campaign, data)]
+    parts = campaign.study.report(data) or [summary(campaign, data)]
+    return [*parts, *_damage(Store(campaign.path).damaged(campaign.study))]
 
 
 def summary(campaign: Campaign, data: Any) -> RenderableType:

@@ -214,16 +214,23 @@ class Store:
         """
         for left in self.path.rglob("*.partial"):
             left.unlink(missing_ok=True)
-        damaged = []
-        for shard in np.flatnonzero(marks := self.marks()).tolist():
-            try:
-                good = digest(study.same_bits(self.read(study, shard))) == int(marks[shard])
-            except ArtefactError:
-                good = False
-            if not good:
-                damaged.append(shard)
-                self._done[shard] = 0
+        damaged = self.damaged(study)
+        for shard in damaged:
+            self._done[shard] = 0
         return damaged
+
+    def damaged(self, study: Study) -> list[int]:
+        """Return the numbers of finished shards whose chunks are not what was written."""
+        marks = self.marks()
+        done = np.flatnonzero(marks).tolist()
+        return [shard for shard in done if not self.has(study, shard, int(marks[shard]))]
+
+    def has(self, study: Study, shard: int, mark: int) -> bool:
+        """Whether the chunks of a shard can be read, and have this digest."""
+        try:
+            return digest(study.same_bits(self.read(study, shard))) == mark
+        except ArtefactError:
+            return False
 
 
 def _meanings(words: Sequence[str]) -> dict[str, Any]:

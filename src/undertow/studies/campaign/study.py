@@ -93,6 +93,11 @@ class Study(ABC):
     most: int
     seed: int
 
+    @cached_property
+    def notes(self) -> list[str]:
+        """What is to be said of the shards that were computed here."""
+        return []
+
     @abstractmethod
     def __init__(self, mechanism: Mechanism, settings: Settings) -> None:
         """Take the settings of this kind, and refuse wrong ones before any work."""

@@ -12,6 +12,7 @@ import numpy as np
 from undertow.base import between, one_of
 from undertow.closed_loop.figures import display
 from undertow.models import FloatArray, Mechanism, Parameter, invariant_coordinates, number_of
+from undertow.models.importers import holding_input
 from undertow.objective import Goal
 from undertow.objective.named import finite_limits
 from undertow.plants import Bench
@@ -26,6 +27,9 @@ OBJECTIVE, PERIOD, PUSH = "objective", "period", "push"
 
 #: Periods of re-optimisation that can be chosen, s: multiples of the predictions' step.
 SHORTEST, LONGEST = 0.05, 1.0
+
+#: How far limits of inputs go, as parts of their values; the least is so many times what holds.
+WEAK, STRONG, HOLDS = 0.1, 1.5, 1.25
 
 #: How far masses and inertias, lengths, and damping of the plant go, as parts of their values; and
 #: dry friction, as a part of the full input, or of what a lean of 1 rad or m asks of a free joint.
@@ -161,14 +165,7 @@ def controls_of(mechanism: Mechanism, objective: str, period: float) -> Controls
         Control(
             PERIOD, "re-optimised every", "controller", period, SHORTEST, LONGEST, period, "s"
         ),
-        *(
-            Control(
-                f"limit {channel.name}", f"limit of {channel.name}", "controller", channel.limit,
-                0.1 * channel.limit, 1.5 * channel.limit, channel.limit, channel.unit,
-            )
-            for channel in mechanism.inputs
-            if math.isfinite(channel.limit)
-        ),
+        *_limits(mechanism),
         *_frictions(mechanism),
         *_parameters(mechanism.parameters),
         Control(PUSH, "strength of a push", "hand", 1.0, 0.1, 5.0, 1.0, "×"),
@@ -194,14 +191,26 @@ def _targets(mechanism: Mechanism) -> list[Control]:
     return made
 
 
+def _limits(mechanism: Mechanism) -> list[Control]:
+    """Limit of each input, as far down as it still holds the target with something to spare."""
+    return [
+        Control(
+            f"limit {channel.name}", f"limit of {channel.name}", "controller", channel.limit,
+            min(max(WEAK * channel.limit, HOLDS * held), channel.limit), STRONG * channel.limit,
+            channel.limit, channel.unit,
+        )
+        for channel, held in zip(mechanism.inputs, np.abs(holding_input(mechanism)), strict=True)
+        if math.isfinite(channel.limit)
+    ]  # fmt: skip
+
+
 def _frictions(mechanism: Mechanism) -> list[Control]:
     """Dry friction of each coordinate of the plant."""
     lean = np.zeros(2 * mechanism.n)
     made = []
     for i, c in enumerate(mechanism.coordinates):
         if i < mechanism.m:
-            gain = abs(float(mechanism.input_matrix[i, i].subs(mechanism.substitution)))
-            most = ROUGH * gain * float(finite_limits(mechanism)[i])
+            most = ROUGH * float(np.abs(mechanism.B[i]) @ finite_limits(mechanism))
         else:
             lean[i] = 1.0
             most = ROUGH_FREE * float(np.abs(mechanism.f(lean)).max())
