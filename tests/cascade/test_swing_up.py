@@ -162,7 +162,7 @@ def test_gains_that_bring_the_learnt_plant_home_come_first(
     """What arrives is kept until it should have; without a prediction they come in turn."""
 
     class Foreseen:
-        arrives = (3,)
+        arrives: tuple[int, ...] = (3,)
 
         def times(self, choices: tuple[Gains, ...], *_: object) -> np.ndarray:
             return np.array([1.0 if k in self.arrives else math.inf for k in range(len(choices))])
