@@ -635,7 +635,7 @@ class Cascade:
                     self._planners, self._judge, x, leg.target, t, memory, leg.longest
                 )
                 admission = self.first_admission(memory, x, leg.longest)
-            elif home or (arrived and leg.stays):
+            elif home:
                 if leg.stays and memory.plan != holding.plan:
                     proposal = holding_plan(self._planners, memory, memory.error(t, x), t)
                 if proposal is not None:
