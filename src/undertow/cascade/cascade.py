@@ -649,7 +649,8 @@ class Cascade:
                 )
                 memory, admission = self.apply_gate(memory, proposal, x, left)
             if proposal is not None:
-                task += not updates or since > updates[-1].t
+                begins = t == leg.begin or not home  # to hold what was reached begins no task
+                task += not updates or (begins and since > updates[-1].t)
                 plan, predicted = memory.plan, memory.predicted
                 updates.append(Update(t, x, proposal, admission, plan, predicted, spent, task))
                 spent, planned_with = 0.0, memory.estimate
