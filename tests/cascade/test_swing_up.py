@@ -156,6 +156,28 @@ def test_from_hanging_to_balanced_and_again_after_a_knock(
     assert np.abs(run.record.u).max() <= 15.0
 
 
+def test_gains_that_bring_the_learnt_plant_home_come_first(
+    arm: ut.Mechanism, region: CatchRegion
+) -> None:
+    """What arrives is kept until it should have; without a prediction they come in turn."""
+
+    class Foreseen:
+        arrives: tuple[int, ...] = (3,)
+
+        def times(self, choices: tuple[Gains, ...], *_: object) -> np.ndarray:
+            return np.array([1.0 if k in self.arrives else math.inf for k in range(len(choices))])
+
+    controller, foreseen = SwingUpAndCatch(designed(arm), region), Foreseen()
+    controller._learning = Measured(arm)
+    vars(controller)["_attempts"] = foreseen
+    chosen = []
+    for t, arrives in ((0.0, (3,)), (1.5, (1, 3)), (4.5, (3,)), (5.0, (3,)), (6.0, (3,))):
+        foreseen.arrives = arrives
+        controller(t, hanging(arm))
+        chosen.append(controller._choice)
+    assert chosen == [3, 3, 4, 4, 3]
+
+
 def test_nothing_moves_without_a_swing(arm: ut.Mechanism) -> None:
     """What the trial must overcome: with zero input the pendulum hangs."""
     rig = RealisticRig(srv02_rig(), hanging(arm), 0)

@@ -248,3 +248,13 @@ def test_what_is_predicted_in_one_go_is_predicted_in_two(
     later = cascade.predicted_error(state, error, 1.0, 1.5)
     assert np.linalg.norm(later - error) > 0.1
     assert cascade.predicted_error(state, halfway, 1.2, 1.5) == pytest.approx(later, rel=1e-5)
+
+
+def test_what_was_reached_comes_to_rest() -> None:
+    """What arrives for least energy hardly damps: once home another surface holds it."""
+    cascade = ut.Cascade(
+        CRANE, ut.objective_for(CRANE, "bench-energy", horizon=4.0), belief="exact"
+    )
+    run = cascade.simulate(CRANE.state(x=0.2), target={"x": 0.0}, duration=9.0)
+    assert run.reached
+    assert np.linalg.norm(run.trajectory.x[-1]) < 0.1 * cascade.objective.terminal_radius

@@ -13,7 +13,6 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Literal, cast
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from undertow.base import (
@@ -27,7 +26,7 @@ from undertow.base import (
 )
 from undertow.cascade.judge import Judge
 from undertow.cascade.planners import Planners, searched
-from undertow.cascade.planning import first_plan, next_plan
+from undertow.cascade.planning import first_plan, holding_plan, next_plan
 from undertow.cascade.predictions import Predictions
 from undertow.cascade.reserve import Reserve
 from undertow.cascade.simulation import (
@@ -629,9 +628,8 @@ class Cascade:
         for leg, t, span, due in moments(self, legs, plants):
             truth = plants.get(round(t / self.stride), truth)
             proposal: Proposal | None = None
-            home = memory is not None and bool(
-                np.linalg.norm(memory.error(t, x)) <= self.objective.terminal_radius
-            )
+            holding = self._planners.holding
+            home = memory is not None and holding.at_home(memory, memory.error(t, x), t)
             if t == leg.begin or home or arrived:  # to leave what was reached begins another task
                 since = t
             if memory is None or t == leg.begin:
@@ -639,9 +637,12 @@ class Cascade:
                     self._planners, self._judge, x, leg.target, t, memory, leg.longest
                 )
                 admission = self.first_admission(memory, x, leg.longest)
-            elif not home and (
-                due or is_news(planned_with, memory.estimate) or not self.survives(memory, x, t)
-            ):
+            elif home:
+                if leg.stays and memory.plan != holding.plan:
+                    proposal = holding_plan(self._planners, memory, memory.error(t, x), t)
+                if proposal is not None:
+                    memory, admission = self.apply_gate(memory, proposal, x, leg.longest)
+            elif due or is_news(planned_with, memory.estimate) or not self.survives(memory, x, t):
                 left = leg.longest - (t - since)
                 if left <= 0.5 * self.step:  # a disturbed plant came too late: a new horizon
                     since, left = t, leg.longest
@@ -650,7 +651,8 @@ class Cascade:
                 )
                 memory, admission = self.apply_gate(memory, proposal, x, left)
             if proposal is not None:
-                task += not updates or since > updates[-1].t
+                begins = t == leg.begin or not home  # to hold what was reached begins no task
+                task += not updates or (begins and since > updates[-1].t)
                 plan, predicted = memory.plan, memory.predicted
                 updates.append(Update(t, x, proposal, admission, plan, predicted, spent, task))
                 spent, planned_with = 0.0, memory.estimate

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cached_property
 
+from undertow.cascade.holding import Holding
 from undertow.cascade.predictions import Predictions
 from undertow.closed_loop import ClosedLoop
 from undertow.law import ReferenceMotion
@@ -53,6 +54,11 @@ class Planners:
     ) -> None:
         self.predictions, self.optimiser = predictions, optimiser
         self.own, self.recourse = own, recourse
+
+    @cached_property
+    def holding(self) -> Holding:
+        """What says whether a target is held, and with what."""
+        return Holding(self.predictions, self.optimiser.anchor)
 
     @cached_property
     def _robust(self) -> Optimiser:

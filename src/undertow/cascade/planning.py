@@ -179,6 +179,19 @@ def _first_tries(
     return tries
 
 
+def holding_plan(
+    planners: Planners, state: CascadeState, error: FloatArray, t: float
+) -> Proposal | None:
+    """The plan that holds what was reached, at no cost; ``None``: see :class:`Holding`.
+
+    A planner of one's own decides for itself.
+    """
+    plan = planners.holding.best(state, error, t) if planners.own is None else None
+    if plan is None:
+        return None
+    return Proposal(plan, "converged", 0.0, 0.0, (), 1, 0.0, state.sequence + 1, t)
+
+
 def next_plan(
     planners: Planners,
     judge: Judge,

@@ -11,36 +11,22 @@ import contextlib
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
 from undertow.base import InvalidInputError, UndertowError
+from undertow.cascade.swing_up.attempts import Attempts, unclipped
 from undertow.cascade.swing_up.law import SwingUp, periods
 from undertow.closed_loop import ClosedLoop
 from undertow.estimators import Estimator
 from undertow.law import InnerLoop, ProvedSet, ReachingLaw, Surface, first_surface
-from undertow.models import FloatArray, Mechanism, linearise
+from undertow.models import FloatArray, Mechanism
 from undertow.objective import MinimumTime, state_box
 from undertow.plants.simulated import IdealRig
 
 #: Proves regions of attraction for some of a mechanism's surfaces under a reaching law.
 Prove = Callable[[Mechanism, Sequence[Surface], ReachingLaw], Iterable[ProvedSet]]
-
-
-def unclipped(mechanism: Mechanism) -> tuple[FloatArray, float, FloatArray]:
-    """Return P of a linear-quadratic regulator, the largest level at which it never clips, k.
-
-    With R = 1/u_max² and u = k x, |k x| ≤ u_max on xᵀPx ≤ 1/(u_max² BᵀPB).
-    """
-    from scipy.linalg import solve_continuous_are  # slow to import
-
-    lin = linearise(mechanism)
-    n, m = mechanism.n, mechanism.m
-    limit = mechanism.inputs[0].limit
-    Q = np.diag([0.1] * m + [1.0] * (n - m) + [0.01] * n)
-    P = np.asarray(solve_continuous_are(lin.A, lin.input, Q, np.eye(m) / limit**2), np.float64)
-    k = -(limit**2) * (lin.input.T @ P)[0]
-    return P, float(1.0 / (limit**2 * (lin.input.T @ P @ lin.input)[0, 0])), k
 
 
 class CatchRegion:
@@ -187,6 +173,8 @@ class SwingUpAndCatch:
         Time between two tests of the region, s.
     patience
         Time after which a swing-up that has not led to a catch goes on with other gains, s.
+    again
+        Time between two looks ahead, s: with an estimator that learns, see :meth:`listen`.
     lost
         Free coordinates further than this from the target have been thrown out, rad or m.
 
@@ -200,17 +188,24 @@ class SwingUpAndCatch:
     region: CatchRegion
     every: float = 0.005
     patience: float = 4.0
+    again: float = 1.0
     lost: float = math.radians(60.0)
     events: list[tuple[float, str]] = field(default_factory=list)
     _law: InnerLoop | None = None
     _learning: Estimator | None = None
     _offset: FloatArray = field(default_factory=lambda: np.zeros(0), repr=False)
     _next: float = 0.0
+    _look: float = 0.0
     _since: float | None = None
     _choice: int = 0
 
     def listen(self, estimator: Estimator) -> None:
-        """Balance with the parameters that an estimator learns, if it is for the same mechanism."""
+        """Go by the parameters that an estimator learns, if it is for the same mechanism.
+
+        They balance, and they say, every now and then, which gains bring home the plant that is
+        there: no gains suit all plants, and on one that is a little heavier those that suit the
+        model leave a second link hanging.
+        """
         if estimator.belief is not None:
             same = estimator.mechanism.fingerprint == self.region.mechanism.fingerprint
             self._learning = estimator if same else None
@@ -226,8 +221,7 @@ class SwingUpAndCatch:
             self.events.append((t, "lost"))
         if self._since is None:
             self._since = t
-        if t - self._since > self.patience:
-            self._since, self._choice = t, self._choice + 1
+        self._choose(t, self._since, x)
         offset = self.region.turns(x)
         if t >= self._next and self.worth_asking(x):
             self._next = t + self.every
@@ -238,6 +232,31 @@ class SwingUpAndCatch:
                 self.events.append((t, "catch"))
                 return self._balanced(x - offset)
         return self.swing(x, self._choice)
+
+    def _choose(self, t: float, since: float, x: FloatArray) -> None:
+        """Go on with the next gains after a while in vain, or with others that arrive sooner.
+
+        What is to arrive is left alone until it should have.
+        """
+        gains, choice = self.swing.gains, self._choice
+        tired = t - since > self.patience
+        if tired:
+            choice += 1
+        if self._learning is not None and (tired or t >= self._look):
+            self._look = t + self.again
+            home = x - self.region.turns(x)
+            times = self._attempts.times(gains, home, self._learning.parameters)
+            used = self._choice % len(gains)
+            if tired:  # it was to arrive, if at all
+                times[used] = math.inf
+            if not math.isfinite(times[used]) and np.isfinite(times).any():
+                choice = int(np.argmin(times))
+        if tired or choice != self._choice:
+            self._since, self._choice = t, choice
+
+    @cached_property
+    def _attempts(self) -> Attempts:
+        return Attempts(self.region.mechanism)
 
     def _balanced(self, home: FloatArray) -> FloatArray:
         """Return the input of the law, with what has been learnt by now, (1,)."""

@@ -27,36 +27,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from undertow.base import InfeasibleError
-from undertow.cascade.swing_up.catch import unclipped
-from undertow.cascade.swing_up.law import Gains, SwingUp, hanging, periods, swing_source
+from undertow.cascade.swing_up.attempts import SECONDS, Attempts
+from undertow.cascade.swing_up.law import Gains, SwingUp, hanging
 from undertow.estimators.belief import EVEN, Belief
 from undertow.models import FloatArray, Mechanism
 from undertow.optimiser import CMAES
 from undertow.plants.bench import plausible_rig
-from undertow.plants.stepping import dynamics_source
-from undertow.symbolic import (
-    COMPILED,
-    PREAMBLE,
-    content_key,
-    docstring,
-    generated,
-    recall,
-    remember,
-)
+from undertow.symbolic import content_key, recall, remember
 
 #: Gains of mechanisms of the library, as the search found them: see :func:`kept_text`.
 KEPT = Path(__file__).with_name("gains.json")
 
-#: A swing may take so long, s, before other gains are tried; its law is held for so long, s.
-SECONDS, STEP = 4.0, 0.002
-
 #: Dry friction of the driven joint, up to this part of the input's limit; the part of the
 #: swings that begins anywhere, not hanging at rest.
 DRAG, ANYWHERE = 0.03, 0.25
-
-#: From a state with xᵀPx up to this many times what the regulator holds without clipping it is
-#: tried whether it comes home, clipped, every so many steps, within so long, s.
-REACH, EVERY, HOME = 4.0, 5, 3.0
 
 #: Random gains and the swings that each is tried on; those that are tried on all swings; so many
 #: generations refine the best.  Gains that are found, one after the other; swings of which those
@@ -66,94 +50,6 @@ TURNS, LOOKED, FRESH = 6, 1024, 512
 
 #: Where gains lie, decades about their scales: k_D, k_P, k_V, surplus, k_E.
 DECADES = np.array([[-2.5, 1.5], [-2.5, 1.5], [-2.5, 1.5], [-3.0, -0.3], [-2.5, 1.5]])
-
-_BODY = f"""
-{COMPILED}
-def advance(x, force, plant, drag, limit, gain, stops, h, viscous, u, stages):
-    # A smooth step with dry friction of the driven joint; whether it met no stop.
-    n = x.shape[0] // 2
-    u[0] = force - drag * limit * math.tanh(x[n] / 0.02) * (1.0 if gain > 0.0 else -1.0)
-    rk4_step(0.0, h, 1.0, n, x, u, viscous, plant, stages[0], stages[1], stages[2])
-    for i in range(n):
-        if not stops[i, 0] < x[i] < stops[i, 1]:
-            return False
-    return True
-
-
-{COMPILED}
-def distance(x, P):
-    total = 0.0
-    for i in range(x.shape[0]):
-        for j in range(x.shape[0]):
-            total += x[i] * P[i, j] * x[j]
-    return total
-
-
-{COMPILED}
-def attempt(x, gains, belief, plant, drag, limit, stops, P, level, k, wraps, seconds, h, out):
-    # Time from which the regulator brings it home, infinite where there is none; least xᵀPx/level.
-    # It leaves x where it ended; where it met a stop, as it was.
-    n = x.shape[0] // 2
-    x0, near, stages = x.copy(), x.copy(), np.zeros((3, 2 * n))
-    viscous, u, work = np.zeros(n), np.zeros(1), np.zeros(6)
-    out[0], out[1] = math.inf, math.inf
-    wait = 0
-    for step in range(int(seconds / h)):
-        force = swing(x, gains, belief, limit, 0.0, work)
-        gain = work[4]
-        if not advance(x, force, plant, drag, limit, gain, stops, h, viscous, u, stages):
-            out[1] = math.inf
-            for i in range(2 * n):
-                x[i] = x0[i]
-            return
-        for i in range(n):
-            turn = wraps[i]
-            near[i] = x[i] - turn * math.floor(x[i] / turn + 0.5) if turn > 0.0 else x[i]
-            near[n + i] = x[n + i]
-        ratio = distance(near, P) / level
-        out[1] = min(out[1], ratio)
-        wait -= 1
-        if ratio > {REACH} or wait > 0:
-            continue
-        wait = {EVERY}
-        for _ in range(int({HOME} / h)):
-            force = 0.0
-            for i in range(2 * n):
-                force += k[i] * near[i]
-            force = max(-limit, min(limit, force))
-            if not advance(near, force, plant, drag, limit, gain, stops, h, viscous, u, stages):
-                break
-            ratio = distance(near, P) / level
-            if ratio > 10.0 * {REACH}:
-                break
-            if ratio < 0.05:
-                out[0] = step * h
-                return
-
-
-{COMPILED}
-def attempts(
-    starts, gains, belief, plants, drags, limit, stops, P, level, k, wraps, seconds, h, out
-):
-    for i in range(out.shape[0]):
-        attempt(
-            starts[i], gains, belief, plants[i], drags[i], limit, stops, P, level, k, wraps,
-            seconds, h, out[i],
-        )
-"""
-
-
-@lru_cache(maxsize=32)
-def _module(mechanism: Mechanism) -> Any:
-    key = content_key(mechanism.structure, mechanism.name)
-
-    def write() -> str:
-        words = docstring(f"Swings of {mechanism.name}; generated, do not edit.")
-        head = f"{words}{PREAMBLE}"
-        parts = (head, dynamics_source(mechanism), swing_source(mechanism), _BODY)
-        return "\n\n".join(parts)
-
-    return generated("attempts", mechanism.name, key, write)
 
 
 @dataclass(frozen=True)
@@ -195,12 +91,8 @@ class _Swings:
         parts = {name: EVEN * tolerance / values[name] for name, tolerance in known.items()}
         self.bench = replace(plausible_rig(mechanism), tolerance=parts)
         self.low, n = hanging(mechanism), mechanism.n
-        self.P, self.level, self.k = unclipped(mechanism)
-        self.wraps = periods(mechanism)
-        self.stops = np.array([[0.97 * c.low, 0.97 * c.high] for c in mechanism.coordinates])
+        self.attempts = Attempts(mechanism)
         self.missing = float(mechanism.energy(np.zeros(2 * n)) - mechanism.energy(self.low))
-        self._module, self._limit = _module(mechanism), mechanism.inputs[0].limit
-        self._belief = mechanism.parameter_values
 
     def _draw(self, number: int) -> tuple[FloatArray, FloatArray, float]:
         rng = np.random.default_rng([self.seed, number])
@@ -212,7 +104,8 @@ class _Swings:
     def _anywhere(self, rng: np.random.Generator) -> FloatArray:
         """Return a state with no more than half the missing energy above the target's, (2n,)."""
         mechanism, n = self.mechanism, self.mechanism.n
-        room = np.where(self.wraps > 0, math.pi, 0.5 * np.minimum(1.0, self.stops[:, 1]))
+        wraps, stops = self.attempts.wraps, self.attempts.stops
+        room = np.where(wraps > 0, math.pi, 0.5 * np.minimum(1.0, stops[:, 1]))
         x = np.concatenate([room * rng.uniform(-1.0, 1.0, n), rng.standard_normal(n)])
         kinetic = 0.5 * float(x[n:] @ mechanism.M(x[:n]) @ x[n:])
         still = mechanism.energy(np.concatenate([x[:n], np.zeros(n)]))
@@ -227,12 +120,7 @@ class _Swings:
 
     def __call__(self, gains: FloatArray, batch: _Batch) -> tuple[FloatArray, FloatArray]:
         """Return times and nearest distances, (N, 2), and where swings have got to, (N, 2n)."""
-        out, states = np.empty((len(batch), 2)), batch.starts.copy()
-        self._module.attempts(
-            states, gains, self._belief, batch.plants, batch.drags, self._limit, self.stops,
-            self.P, self.level, self.k, self.wraps, SECONDS, STEP, out,
-        )  # fmt: skip
-        return out, states
+        return self.attempts(gains, batch.starts, batch.plants, batch.drags)
 
     def left(self, found: Sequence[FloatArray], batch: _Batch) -> tuple[_Batch, int]:
         """Return what the next gains meet after those that were found, and how many are left.
