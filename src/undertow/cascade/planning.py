@@ -27,7 +27,19 @@ from undertow.optimiser.proposal import check_held
 AGREES, FINER = 1.01, 4
 
 
-class FirstTry(NamedTuple):
+class Search(NamedTuple):
+    """A search for a first plan: on what loop, and how.
+
+    In steps of ``fixed`` where that is given; ``repairs``: the plan of the search before is
+    repaired, where there is one, instead of a search from nothing.
+    """
+
+    loop: ClosedLoop
+    fixed: ClosedLoop | None = None
+    repairs: bool = False
+
+
+class Found(NamedTuple):
     """An answer to the search for a first plan, and the cost of its plan where it was judged.
 
     ``rank`` is 0 where it is good, 1 if it is for every plausible plant, 2 if it is for the
@@ -75,9 +87,9 @@ def first_plan(
     single = None
     if belief is not None and known is not None:
         single = whole.believing(whole.mechanism, belief.single(known))
-    last = [] if single is None else [(single, None, False)]
-    tries: list[FirstTry] = []
-    for loop, fixed, near in [*_first_tries(planners, known), *last]:
+    last = [] if single is None else [Search(single)]
+    tries: list[Found] = []
+    for loop, fixed, repairs in [*_first_searches(planners, known), *last]:
         found = tries[-1].proposal if tries else None
         if loop is single and found is not None and found.plan is not None:
             break
@@ -85,7 +97,7 @@ def first_plan(
         if fixed is not None:
             planner = planners.suited(fixed).on(predictions.about(fixed, target, t))
         span = horizon if short else None
-        if near and found is not None and isinstance(planner, Optimiser):
+        if repairs and found is not None and isinstance(planner, Optimiser):
             proposal = planner.repair(x, found, horizon=span)
         else:
             proposal = planner.propose(
@@ -93,7 +105,7 @@ def first_plan(
             )
         plan = proposal.plan
         if plan is None:
-            tries.append(FirstTry(3, math.inf, proposal))
+            tries.append(Found(3, math.inf, proposal))
             continue
         cost = float(about.batch(x, plan, duration=horizon, precise=True).score(horizon)[0])
         cost = cost if cost < INADMISSIBLE else math.inf
@@ -104,7 +116,7 @@ def first_plan(
             good &= lives(here, x, plan)
         if loop.ensemble is None and planners.own is None:
             good &= cost <= AGREES * proposal.cost
-        tries.append(FirstTry(0 if good else 1 if loop is whole else 2, cost, proposal))
+        tries.append(Found(0 if good else 1 if loop is whole else 2, cost, proposal))
         if good:
             break
     best = min(tries, key=lambda one: (one.rank, one.cost))
@@ -143,12 +155,8 @@ def _ahead(
     return optimiser.propose(motion.x[0], horizon=span - period).plan
 
 
-def _first_tries(
-    planners: Planners, estimate: ParameterEstimate | None
-) -> list[tuple[ClosedLoop, ClosedLoop | None, bool]]:
-    """What the first plan is to be best on, one after the other; and in what steps, if fixed.
-
-    And whether the plan of the try before is repaired, in place of a search from nothing.
+def _first_searches(planners: Planners, estimate: ParameterEstimate | None) -> list[Search]:
+    """What the first plan is to be best on, one after the other.
 
     Before anything has moved, what suits every plausible plant suits none of them well: the
     estimate alone comes first, for a plan that the next decision replaces; a schedule for it
@@ -160,7 +168,7 @@ def _first_tries(
     predictions, belief = planners.predictions, planners.predictions.belief
     whole = predictions.plausible(estimate)
     if planners.own is not None:
-        return [(whole, None, False)]
+        return [Search(whole)]
     loops = [whole]
     if belief is not None and estimate is not None:
         loops.insert(0, whole.believing(whole.mechanism, belief.alone(estimate)))
@@ -171,12 +179,13 @@ def _first_tries(
         adapts = loop.ensemble is None and not loop.zoh_steps
         return loop.with_steps(predictions.prior.step / FINER, 0.0) if adapts else loop
 
-    tries: list[tuple[ClosedLoop, ClosedLoop | None, bool]] = []
+    searches = []
     for loop in loops:
         small = smaller(loop)
-        near = loop.ensemble is not None and not loop.price_of_time
-        tries += [(loop, None, False), *[(loop, small, True)] * near, (loop, small, False)]
-    return tries
+        smooth = loop.ensemble is not None and not loop.price_of_time
+        repaired = [Search(loop, small, repairs=True)] if smooth else []
+        searches += [Search(loop), *repaired, Search(loop, small)]
+    return searches
 
 
 def holding_plan(
