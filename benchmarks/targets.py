@@ -1,7 +1,8 @@
 """Targets that move: what jumps cost beside a fresh start, how closely references are followed.
 
 - Set-points every 2 s on the overhead and the gantry crane.  At each jump a fresh start is made
-  from the same state to the same set-point; costs are compared until the next jump.
+  from the same state to the same set-point; costs are compared until the next jump, or for as
+  long as the last one is held.
   Wanted: ≤ 1.1 times the fresh start's; residual swing ≤ 0.5° within 10 s of the last jump.
 - A jump met by the warm search alone, which looks near the old plan, beside the cold one.
 - Sines and a path from a CSV file on both cranes; ±45° of the arm at 0.5 Hz with the rotary
@@ -55,14 +56,14 @@ def jumps(quick: bool) -> None:
         goals = points[: 2 if quick else None]
         cascade = cascade_for(rig, "bench-energy", 8.0)
         schedule = ut.SetPoints([(2.0 * k, goal) for k, goal in enumerate(goals)])
-        last = schedule.times[-1]
-        run = cascade.simulate(rig.state(), target=schedule, duration=last + 14.0)
+        last, held = schedule.times[-1], 14.0
+        run = cascade.simulate(rig.state(), target=schedule, duration=last + held)
         motion = run.trajectory
         where: dict[str, float] = {}
         for begin, goal in zip(schedule.times, goals, strict=True):
             where |= goal
             x = motion.x[np.searchsorted(motion.t, begin - 1e-9)]
-            fresh = cascade.simulate(x, target=where).trajectory
+            fresh = cascade.simulate(x, target=where, duration=held).trajectory
             end = begin + 2.0 if begin < last else motion.time
             spent, same = (
                 np.interp(b, path.t, path.accumulated_cost)

@@ -150,7 +150,7 @@ def test_any_mechanism_has_dials() -> None:
     drawn = sketch(one)
     assert len(drawn.parts) == 3 * one.n
     named = [part.text for part in drawn.parts if isinstance(part, Label)]
-    assert named == [f"{c.name}, {c.unit}" for c in one.coordinates]
+    assert named == ["q0, m", "q1, °", "q2, °"]  # as in charts
     points, _, _ = evaluator(one, drawn)(np.array([[0.5, 0.0, np.pi / 2]]))
     np.testing.assert_allclose(points[1][0, 0], [0.5, 0, 0])
     np.testing.assert_allclose(points[5][0, 1] - points[5][0, 0], [1, 0, 0], atol=1e-12)

@@ -603,9 +603,9 @@ class Cascade:
         target
             Where to, x = 0 by default: a mapping of coordinates to positions, rad or m;
             :class:`undertow.SetPoints`, which jump; or a :class:`undertow.Reference`, which moves.
-            With a duration the run then goes on to its end, holding what it has reached; without
-            one until the last set-point, or the end of a horizon.  See
-            :mod:`undertow.cascade.simulation`.
+            With a duration the run then goes on to its end, holding what it has reached, see
+            :mod:`undertow.cascade.holding`; without one until the last set-point, or the end of a
+            horizon.  See :mod:`undertow.cascade.simulation`.
         progress
             Called with (time, duration) each time that it decides or learns.
 

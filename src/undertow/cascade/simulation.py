@@ -2,9 +2,10 @@
 
 A run goes along legs.  A run to x = 0 has one, without a target, and ends where it arrives.  A
 set-point is a task of its own, as if started afresh from where the last one was left: its first
-plan is found by the global search.  Cost counts until the terminal set about the set-point is
-reached; then the mechanism is held there, at no cost, until the target jumps.  A reference is one
-task: cost counts while the error is outside the terminal set about it.
+plan is found by the global search.  Cost counts while the error is outside the terminal set about
+the set-point; once it was reached the mechanism is held there, see :mod:`.holding`, until the
+target jumps.  A reference is one task: cost counts while the error is outside the terminal set
+about it.
 """
 
 from __future__ import annotations

@@ -75,6 +75,10 @@ def cost_gate(loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, horizon: fl
         return Admission(
             False, f"raises the predicted cost: {new_cost:.6g} > {old_cost:.6g}", old_cost
         )
+    if math.isinf(old_cost):
+        whom = "" if loop.ensemble is None else " for every plausible plant"
+        reason = f"stable and feasible{whom}, as the plan in use no longer is"
+        return Admission(True, reason, float(new_cost))
     return Admission(True, _ADMITTED, float(new_cost))
 
 
