@@ -268,6 +268,16 @@ def test_gate_believes_nothing_that_the_optimiser_says(cascade: ut.Cascade) -> N
     assert swapped.cost == kept
 
 
+def test_a_plan_that_replaces_one_which_comes_home_too_late_says_so(cascade: ut.Cascade) -> None:
+    """Its own cost may be higher than what was predicted of the old one: "not raised" said less."""
+    x = cascade.mechanism.state(phi=ut.deg(30))
+    times = cascade.loop.batch(x, [GOOD, BASE], precise=True).time
+    soon, late = (Plan.of((GOOD, BASE)[k]) for k in np.argsort(times))
+    admission = cost_gate(cascade.loop, late, soon, x, float(times.mean()))
+    assert admission.accepted
+    assert admission.reason == "stable and feasible, as the plan in use no longer is"
+
+
 def test_equal_cost_is_admitted_and_any_more_is_not(cascade: ut.Cascade) -> None:
     """The gate is tight: the surface in use passes, a slightly dearer one does not."""
     x = cascade.mechanism.state(phi=ut.deg(30))
