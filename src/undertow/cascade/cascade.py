@@ -624,11 +624,11 @@ class Cascade:
         memory: CascadeState | None = None
         planned_with: ParameterEstimate | None = None
         truth, task, arrived = plants[0], -1, False
+        holding = self._planners.holding
         spent = since = 0.0  # cost since the last decision; when it was last at the target, s
         for leg, t, span, due in moments(self, legs, plants):
             truth = plants.get(round(t / self.stride), truth)
             proposal: Proposal | None = None
-            holding = self._planners.holding
             home = memory is not None and holding.at_home(memory, memory.error(t, x), t)
             if t == leg.begin or home or arrived:  # to leave what was reached begins another task
                 since = t
@@ -638,7 +638,7 @@ class Cascade:
                 )
                 admission = self.first_admission(memory, x, leg.longest)
             elif home:
-                if leg.stays and memory.plan != holding.plan:
+                if leg.stays:
                     proposal = holding_plan(self._planners, memory, memory.error(t, x), t)
                 if proposal is not None:
                     memory, admission = self.apply_gate(memory, proposal, x, leg.longest)

@@ -22,8 +22,8 @@ import numpy as np
 from undertow.cascade.predictions import Predictions
 from undertow.cascade.state import CascadeState
 from undertow.closed_loop import ClosedLoop, Event
-from undertow.law import Plan, ReachingLaw, Surface, feedback_at_target, stability_margin
-from undertow.models import FloatArray, Mechanism, linearise
+from undertow.law import Plan, ReachingLaw, Surface, matrix_at_target, stability_margin
+from undertow.models import FloatArray, Mechanism
 
 
 @lru_cache(maxsize=16)
@@ -31,8 +31,7 @@ def regulation(mechanism: Mechanism, surface: Surface, reaching: ReachingLaw) ->
     """Return P, (2n, 2n), with xᵀPx = ∫ xᵀx dt near the target; NaN where it is unstable."""
     from scipy.linalg import solve_continuous_lyapunov  # slow to import
 
-    model = linearise(mechanism)
-    A = model.A + model.input @ feedback_at_target(mechanism, surface, reaching)
+    A = matrix_at_target(mechanism, surface, reaching)
     if not np.linalg.eigvals(A).real.max() < 0:
         return np.full(A.shape, np.nan)
     return np.asarray(solve_continuous_lyapunov(A.T, -np.eye(len(A))), np.float64)
@@ -76,7 +75,7 @@ class Holding:
 
         It has to keep every plausible plant there, with the inputs that it has.
         """
-        if state.target is not None and state.target.moves:
+        if state.plan == self.plan or (state.target is not None and state.target.moves):
             return None
         loop, used = self.predictions.at(state, t), state.at(t)
         held, kept = (self._left(loop, plan, error) for plan in (self.plan, used))

@@ -11,6 +11,7 @@ from undertow.law.inner_loop import (
     InnerLoop,
     feedback_at_target,
     law_module,
+    matrix_at_target,
     pack_law_parameters,
 )
 from undertow.law.reference import Reference, ReferenceMotion, SetPoints, Target, target_of
@@ -63,6 +64,7 @@ __all__ = [
     "gains_at_target",
     "gamma_determinant",
     "law_module",
+    "matrix_at_target",
     "pack_law_parameters",
     "placed_surface",
     "quadratic_designs",

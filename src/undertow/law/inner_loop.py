@@ -16,7 +16,7 @@ import numpy as np
 from undertow.law.schedule import Plan
 from undertow.law.sliding import LawSymbols, SlidingModeLaw, build_law_graph
 from undertow.law.surface import ReachingLaw, Surface, Switching
-from undertow.models import FloatArray, Mechanism
+from undertow.models import FloatArray, Mechanism, linearise
 from undertow.symbolic import BRIEF, Tape, Workspace, function_source, scalar_module, unpacked
 
 
@@ -141,6 +141,20 @@ def feedback_at_target(
     k = InnerLoop(mechanism, surface, reaching or ReachingLaw()).feedback()
     k.flags.writeable = False
     return k
+
+
+def matrix_at_target(
+    mechanism: Mechanism, surface: Surface, reaching: ReachingLaw | None = None
+) -> FloatArray:
+    """Return A of the closed loop ẋ = Ax near the target, (2n, 2n); the paper's gains by default.
+
+    Raises
+    ------
+    ModelError
+        As for :func:`undertow.models.linearise`.
+    """
+    plant = linearise(mechanism)
+    return plant.A + plant.input @ feedback_at_target(mechanism, surface, reaching)
 
 
 def pack_law_parameters(law: SlidingModeLaw) -> FloatArray:

@@ -9,8 +9,8 @@ import numpy as np
 
 from undertow.base import InvalidInputError, require
 from undertow.closed_loop import ClosedLoop, Event
-from undertow.law import Surface, feedback_at_target, first_surface
-from undertow.models import FloatArray, Mechanism, fastest_rate, linearise
+from undertow.law import Surface, first_surface, matrix_at_target
+from undertow.models import FloatArray, Mechanism, fastest_rate
 from undertow.studies.campaign.definition import Settings, objective_of
 from undertow.studies.campaign.study import Arrays, Study, Variable, axes_of, state_units
 
@@ -81,10 +81,7 @@ class RegionMap(Study):
         rate = fastest_rate(self.mechanism)
         if not rate > 0:
             return rate
-        lin = linearise(self.mechanism)
-        under = lin.A + lin.input @ feedback_at_target(
-            self.mechanism, self.surface, self.loop.reaching
-        )
+        under = matrix_at_target(self.mechanism, self.surface, self.loop.reaching)
         return max(rate, float(np.abs(np.linalg.eigvals(under)).max()))
 
     @property
