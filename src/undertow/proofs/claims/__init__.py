@@ -3,7 +3,7 @@
 Begin at :mod:`.claim`. :mod:`.document` writes and reads the file, :mod:`.verify` decides it again.
 """
 
-from undertow.proofs.claims import (  # noqa: F401 (whoever imports one has the words of all)
+from undertow.proofs.claims import (  # noqa: F401 - each has the words of its kind
     closed_loop,
     nonsingular,
     reaching,
