@@ -7,6 +7,7 @@ import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from runs import RECIPE
 from support import rest_slow
 from undertow.base import InvalidInputError
 from undertow.cascade import Admission, CascadeState
+from undertow.cascade.swing_up import Gains
 from undertow.law import Plan, law_module
 from undertow.plants import Measurement, Push, RealisticRig
 from undertow.runtime import (
@@ -33,9 +35,11 @@ from undertow.runtime import (
     replay,
     respond,
 )
+from undertow.runtime.encoding import answer_from, answer_row
+from undertow.runtime.log import ANSWERS
 from undertow.runtime.modes import Reason, transition
 from undertow.runtime.session import session
-from undertow.runtime.slow_loop import Answer, LeadTime, Request
+from undertow.runtime.slow_loop import Answer, LeadTime, Request, next_of_swing
 from undertow.studies.fault_injection.cases import OutputMonitor
 
 #: A run from hanging: its surfaces, and the regions where they catch, are computed once for all.
@@ -197,6 +201,48 @@ def test_a_catch_is_refused_where_the_state_is_not_the_predicted_one() -> None:
     for i in range(40):
         rig.write(controller.step(Inputs(1e-3 * (k + 1 + i), rig.read())))
         assert controller.mode == Mode.SWING_UP
+
+
+def test_a_swing_up_goes_on_with_gains_that_bring_home_what_was_learnt(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Asked far from a catch, once a second; used when they are due; in turn after a while."""
+    recipe = SWINGING
+    assert recipe.swing is not None
+    learnt = []
+
+    def times(choices: tuple[Gains, ...], x: np.ndarray, plant: np.ndarray) -> np.ndarray:
+        learnt.append(plant)
+        return np.array([1.0 if k == 4 else math.inf for k in range(len(choices))])
+
+    monkeypatch.setitem(vars(recipe.swing), "_attempts", SimpleNamespace(times=times))
+    monkeypatch.setattr(recipe.swing, "worth_asking", lambda x: False)  # no catch
+    controller, rig = recipe.make_controller(recipe.first()), recipe.make_rig()
+    said, asked, answer = [], [], None
+    for k in range(6000):
+        command = Command.START if k == 0 else Command.NONE
+        rig.write(controller.step(Inputs(1e-3 * k, rig.read(), answer, command)))
+        said += [(1e-3 * k, note.text) for note in controller.notes if note.kind == "swing-up"]
+        request, answer = controller.request, None
+        if request is not None:
+            asked.append((request.t, request.swing))
+            answer = recipe.respond(request)
+            assert answer.gains == 4
+            row = dict(zip(ANSWERS, answer_row(k, answer), strict=True))
+            again = next_of_swing(
+                recipe.cascade, recipe.swing, answer_from(row).before, answer.x, request.swing
+            )
+            assert again == (None, answer_from(row).gains)
+    (begun, first), *rest = asked
+    assert first == 0
+    assert [text for _, text in said] == [
+        "goes on with gains 5 of 6", "goes on with gains 6 of 6", "goes on with gains 5 of 6",
+    ]  # fmt: skip
+    assert said[0][0] == pytest.approx(begun + 0.02)
+    assert said[1][0] == pytest.approx(said[0][0] + recipe.swing.patience, abs=2e-3)
+    assert said[2][0] == pytest.approx(said[1][0] + 0.021, abs=2e-3)
+    assert [t for t, _ in rest[:3]] == pytest.approx([begun + 1, begun + 2, begun + 3])
+    assert not np.array_equal(learnt[0], learnt[-1])
 
 
 def test_the_two_halves_of_a_step_are_the_step(memory: CascadeState) -> None:

@@ -189,7 +189,8 @@ class Controller:
         self._arrived: Answer | None = None
         self._used: Answer | None = None
         self._followed, self._free, self._t = True, False, 0.0
-        self._sequence, self._swinging, self._began = memory.sequence, 0.0, 0.0
+        self._sequence, self._began = memory.sequence, 0.0
+        self._gains, self._swinging, self._look = 0, 0.0, 0.0
         most = max(settings.lead_time, settings.max_lead_time)
         self._lead = LeadTime(settings.lead_time, most, cascade.step)
         self._catch_lead = LeadTime(CATCH_LEAD, MOST_CATCH_LEAD, cascade.step)
@@ -460,7 +461,7 @@ class Controller:
         elif mode is Mode.BRING_UP:
             self._began = t
         elif mode is Mode.SWING_UP:
-            self._swinging, self._pending = t, None
+            self._swinging, self._look, self._pending = t, t, None
             if self.memory.target is not None:  # what catches does so at x = 0
                 self._ahead.insert(0, (t, self.memory.target))
         elif mode is Mode.CATCH and self.mode is Mode.BRING_UP:
@@ -477,7 +478,17 @@ class Controller:
     def _gains_in_use(self, t: float) -> int:
         """Which of the swing-up's gains are in use: others after a while without a catch."""
         assert self.swing_up is not None  # nothing else leads to this state
-        return int((t - self._swinging) / self.swing_up.patience)
+        if t - self._swinging > self.swing_up.patience:
+            self._look = t
+            self._go_on_with(self._gains + 1, t)
+        return self._gains
+
+    def _go_on_with(self, gains: int, t: float) -> None:
+        """Go on with other gains of the swing-up."""
+        assert self.swing_up is not None  # as above
+        self._gains, self._swinging = gains, t
+        count = len(self.swing_up.swing.gains)
+        self.notes.append(Note("swing-up", f"goes on with gains {gains % count + 1} of {count}"))
 
     # -- the slow loop ---------------------------------------------------------------------
 
@@ -507,10 +518,19 @@ class Controller:
         elif self.mode is not Mode.SWING_UP:
             lead = EARLY_LEAD if self._early else self._lead.seconds
             self._asked, self._early = Request(t, self.wrapped.copy(), t + lead, self.memory), False
-        elif self.swing_up is not None and self.swing_up.worth_asking(self.x):
+        elif self.swing_up is not None and self._asks_in_a_swing(t, self.swing_up):
             use = t + self._catch_lead.seconds
             self._asked = Request(t, self.x.copy(), use, self.memory, self._gains_in_use(t))
         self.request = self._asked
+
+    def _asks_in_a_swing(self, t: float, swing_up: SwingUpAndCatch) -> bool:
+        """Whether a catch is within reach, or it is time to ask which gains lead to one."""
+        if swing_up.worth_asking(self.x):
+            return True
+        if self._learning is None or t < self._look:
+            return False
+        self._look = t + swing_up.again
+        return True
 
     def _jumps_next(self, t: float) -> bool:
         """Whether the next request is for a plan to another target."""
@@ -626,6 +646,8 @@ class Controller:
 
     def _note_outcome(self, answer: Answer) -> None:
         """Note what became of an answer at its time of use."""
+        if answer.gains != answer.swing == self._gains and self.mode is Mode.SWING_UP:
+            self._go_on_with(answer.gains, self._t)
         (off, margin), most = self._off.tolist(), self._max_error
         if answer.jump and not self._jump_error <= most:
             off = self._jump_error

@@ -326,6 +326,7 @@ def answer_row(k: int, answer: Answer) -> tuple[object, ...]:
         "message": proposal.message,
         "swing": answer.swing,
         "jump": answer.jump,
+        "gains": answer.gains,
     }
     return (
         k, answer.sequence, answer.use, int(admission.accepted), admission.reason, proposal.status,
@@ -365,4 +366,5 @@ def answer_from(row: Mapping[str, Any], reference: ReferenceMotion | None = None
         row["seconds"],
         body["swing"],
         body.get("jump", False),
+        body.get("gains", body["swing"]),
     )

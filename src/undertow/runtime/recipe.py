@@ -294,7 +294,8 @@ class Recipe:
         if self.swing is not None:
             with contextlib.suppress(UndertowError):
                 memory = cascade.start(x)[0]
-            self.respond(Request(0.0, x, step, memory, 0))
+            for place in (hanging(self.belief), x):
+                self.respond(Request(0.0, place, step, memory, 0))
         self.respond(Request(0.0, x, step, memory))
         if self.legs or (jumps and invariant_coordinates(self.belief)):
             home = SetPoints({})

@@ -34,7 +34,7 @@ from undertow.runtime.encoding import (
 from undertow.runtime.modes import Command
 from undertow.runtime.recipe import Recipe
 from undertow.runtime.recording import Recording, read_log
-from undertow.runtime.slow_loop import Answer, judge, law_vectors_of
+from undertow.runtime.slow_loop import Answer, judge, law_vectors_of, next_of_swing
 from undertow.symbolic import processor, sources_digest
 
 
@@ -317,10 +317,11 @@ def _changes(then: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tuple
 
 
 def _same_decision(controller: Controller, answer: Answer) -> bool:
-    """Let the gate judge a recorded answer again, or look for the surface that catches."""
-    cascade = controller.cascade
-    if answer.swing >= 0 and controller.swing_up is not None:
-        return controller.swing_up.region.surface(answer.x) == answer.proposal.surface
+    """Let the gate judge a recorded answer again, or look for what goes on with a swing-up."""
+    cascade, swing_up = controller.cascade, controller.swing_up
+    if answer.swing >= 0 and swing_up is not None:
+        found = next_of_swing(cascade, swing_up, answer.before, answer.x, answer.swing)
+        return found == (answer.proposal.surface, answer.gains)
     if answer.proposal.plan is None and answer.proposal.status not in ("failed", "infeasible"):
         return True  # what the optimiser said could not be written down
     if answer.jump:  # the first plan of a task is compared with none

@@ -18,7 +18,7 @@ import numpy as np
 from undertow.base import error_text
 from undertow.cascade import Admission, Cascade, CascadeState
 from undertow.cascade.swing_up import SwingUpAndCatch
-from undertow.law import Plan, ReferenceMotion, SlidingModeLaw, pack_law_parameters
+from undertow.law import Plan, ReferenceMotion, SlidingModeLaw, Surface, pack_law_parameters
 from undertow.models import FloatArray
 from undertow.optimiser import Proposal
 
@@ -29,7 +29,8 @@ class Request:
 
     x is counted from ``memory.target``.  With ``target`` the target jumps there at the time of use:
     the plan is for a new task.  With ``swing`` ≥ 0 the mechanism is being swung up, with these
-    gains: is there a surface that catches it?
+    gains: is there a surface that catches it, and where it is not within reach, which gains are to
+    go on?
     """
 
     t: float
@@ -54,7 +55,8 @@ class Answer:
     the gate's decision. ``before``, ``memory``: the cascade's memory as it was asked, and from the
     time of use on. ``law_vectors``: numbers of the law for each surface of the plan, (S, 2mn + 2m +
     1). ``seconds``: from request to answer, s. ``jump``: whether the target jumps at the time of
-    use: ``x`` is counted from the new one.
+    use: ``x`` is counted from the new one. ``gains``: in a swing-up, those to go on with from then
+    on.
     """
 
     sequence: int
@@ -68,6 +70,7 @@ class Answer:
     seconds: float
     swing: int = -1
     jump: bool = False
+    gains: int = -1
 
 
 Compute = Callable[[Request], Answer]
@@ -110,6 +113,7 @@ def is_answer(said: object) -> TypeGuard[Answer]:
         and isinstance(said.memory.plan, Plan)
         and isinstance(said.memory.target, ReferenceMotion | None)
         and isinstance(said.jump, bool)
+        and isinstance(said.gains, int)
         and all(
             isinstance(part, np.ndarray) and part.dtype == float
             for part in (said.x, said.law_vectors)
@@ -133,11 +137,11 @@ def law_vectors_of(cascade: Cascade, memory: CascadeState) -> FloatArray:
 def respond(cascade: Cascade, request: Request, swing_up: SwingUpAndCatch | None = None) -> Answer:
     """Predict, re-optimise, judge; never raises.
 
-    In a swing-up: predict, and look for a surface that catches.
+    In a swing-up: predict, and look for a surface that catches, or for gains that lead to one.
     """
     began = time.perf_counter()
     if request.swing >= 0 and swing_up is not None:
-        return _catch(cascade, request, swing_up, began)
+        return _swing(cascade, request, swing_up, began)
     x = _predicted(cascade, request)
     memory = request.memory
     if request.target is not None:
@@ -183,15 +187,29 @@ def _answer(
     )  # fmt: skip
 
 
-def _catch(cascade: Cascade, request: Request, swing_up: SwingUpAndCatch, began: float) -> Answer:
+def next_of_swing(
+    cascade: Cascade, swing_up: SwingUpAndCatch, memory: CascadeState, home: FloatArray, used: int
+) -> tuple[Surface | None, int]:
+    """Return the surface that catches from a state, (2n,), if any, and the gains to go on with.
+
+    Gains are looked for where the state is not within reach of a catch, for what has been learnt of
+    the plant.  ``used`` are those in use; the state has whole turns taken off.
+    """
+    if swing_up.worth_asking(home):
+        return swing_up.region.surface(home), used
+    parameters = np.array(cascade.believed(memory).parameter_values)
+    return None, swing_up.choice(home, used, parameters)
+
+
+def _swing(cascade: Cascade, request: Request, swing_up: SwingUpAndCatch, began: float) -> Answer:
     """Return an answer whose plan is the surface that catches, if there is one."""
+    memory, gains = request.memory, request.swing
     try:
-        x = swing_up.ahead(request.x, request.use - request.t, request.swing)
+        x = swing_up.ahead(request.x, request.use - request.t, gains)
         home = x - swing_up.region.turns(x)
-        surface = swing_up.region.surface(home)
+        surface, gains = next_of_swing(cascade, swing_up, memory, home, gains)
     except Exception:
         home, surface = np.full_like(request.x, math.nan), None
-    memory = request.memory
     plan = memory.plan if surface is None else Plan.of(surface)
     proposal = Proposal(
         None if surface is None else plan,
@@ -210,7 +228,8 @@ def _catch(cascade: Cascade, request: Request, swing_up: SwingUpAndCatch, began:
     )
     admission = Admission(surface is not None, words, math.inf)
     vectors = law_vectors_of(cascade, after)
-    return _answer(request, home, proposal, after, admission, vectors, began)
+    answer = _answer(request, home, proposal, after, admission, vectors, began)
+    return replace(answer, gains=gains)
 
 
 def judge(

@@ -238,21 +238,29 @@ class SwingUpAndCatch:
 
         What is to arrive is left alone until it should have.
         """
-        gains, choice = self.swing.gains, self._choice
         tired = t - since > self.patience
-        if tired:
-            choice += 1
+        choice = self._choice + tired
         if self._learning is not None and (tired or t >= self._look):
             self._look = t + self.again
-            home = x - self.region.turns(x)
-            times = self._attempts.times(gains, home, self._learning.parameters)
-            used = self._choice % len(gains)
-            if tired:  # it was to arrive, if at all
-                times[used] = math.inf
-            if not math.isfinite(times[used]) and np.isfinite(times).any():
-                choice = int(np.argmin(times))
+            choice = self.choice(x, self._choice, self._learning.parameters, tired=tired)
         if tired or choice != self._choice:
             self._since, self._choice = t, choice
+
+    def choice(
+        self, x: FloatArray, used: int, parameters: FloatArray, *, tired: bool = False
+    ) -> int:
+        """Return which gains to go on with from x, (2n,), on a plant with these parameters, (P,).
+
+        Those in use, unless they do not arrive from there and others do: then the soonest.  When
+        ``tired`` those in use were to arrive by now, if at all, and the next ones come in turn.
+        """
+        gains = self.swing.gains
+        times = self._attempts.times(gains, x - self.region.turns(x), parameters)
+        if tired:
+            times[used % len(gains)] = math.inf
+        if math.isfinite(times[used % len(gains)]) or not np.isfinite(times).any():
+            return used + tired
+        return int(np.argmin(times))
 
     @cached_property
     def _attempts(self) -> Attempts:
