@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from undertow.base import InvalidInputError, UndertowError
+from undertow.base import InvalidInputError, UndertowError, require
 from undertow.cascade.swing_up.attempts import Attempts, unclipped
 from undertow.cascade.swing_up.law import SwingUp, periods
 from undertow.closed_loop import ClosedLoop
@@ -24,6 +24,9 @@ from undertow.law import InnerLoop, ProvedSet, ReachingLaw, Surface, first_surfa
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import MinimumTime, state_box
 from undertow.plants.simulated import IdealRig
+
+#: What catches is home within this time, s, from so many disturbed copies of a state, too.
+SECONDS, COPIES = 8.0, 7
 
 #: Proves regions of attraction for some of a mechanism's surfaces under a reaching law.
 Prove = Callable[[Mechanism, Sequence[Surface], ReachingLaw], Iterable[ProvedSet]]
@@ -47,10 +50,6 @@ class CatchRegion:
     spread
         Standard deviations of the copies, (2n,), SI units: 0.01 rad or m, 0.1 rad/s or m/s by
         default.
-    seconds
-        Home within this time, s.
-    copies
-        Disturbed copies per surface.
     prove
         Called with mechanism, surfaces and reaching law: returns regions of attraction that are
         proved for some of the surfaces, as :func:`undertow.proofs.terminal_sets` does.  The
@@ -59,8 +58,7 @@ class CatchRegion:
     Raises
     ------
     InvalidInputError
-        When the shape of ``spread`` does not fit, there is no copy, or a proved set is of
-        another reaching law.
+        When the shape of ``spread`` does not fit, or a proved set is of another reaching law.
     """
 
     def __init__(
@@ -70,8 +68,6 @@ class CatchRegion:
         *,
         reaching: ReachingLaw | None = None,
         spread: FloatArray | None = None,
-        seconds: float = 8.0,
-        copies: int = 7,
         prove: Prove | None = None,
     ) -> None:
         n = mechanism.n
@@ -84,17 +80,13 @@ class CatchRegion:
             if 0 < min(-c.low, c.high) < math.inf
         }
         goal = replace(
-            MinimumTime(horizon=seconds, terminal_radius=0.1), constraints=state_box(**ranges)
+            MinimumTime(horizon=SECONDS, terminal_radius=0.1), constraints=state_box(**ranges)
         )
         self.loop = ClosedLoop(mechanism, goal, self.reaching)
         if spread is None:
             spread = np.repeat([0.01, 0.1], n)
-        if np.shape(spread) != (2 * n,) or copies < 1:
-            raise InvalidInputError(
-                "spread and copies of a catch region",
-                value=(np.shape(spread), copies),
-                limit=f"({2 * n},) and at least 1",
-            )
+        limit = f"({2 * n},)"
+        require(np.shape(spread) == (2 * n,), "spread of a catch region", np.shape(spread), limit)
         self.proved: tuple[ProvedSet, ...] = ()
         if prove is not None:
             self.proved = tuple(prove(mechanism, self.surfaces, self.reaching))
@@ -106,9 +98,9 @@ class CatchRegion:
                 remedy="Prove the set for the law that catches",
             )
         rng = np.random.default_rng(0)
-        shifts = rng.standard_normal((copies, 2 * n)) * spread
+        shifts = rng.standard_normal((COPIES, 2 * n)) * spread
         self._shifts = np.vstack([np.zeros(2 * n), shifts])
-        self._vectors = np.repeat([s.vector for s in self.surfaces], copies + 1, axis=0)
+        self._vectors = np.repeat([s.vector for s in self.surfaces], COPIES + 1, axis=0)
         self._P, self._level, _ = unclipped(mechanism)
         self._periods = periods(mechanism)
 

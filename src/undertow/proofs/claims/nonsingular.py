@@ -24,8 +24,11 @@ from undertow.proofs.kernel.model import Model
 #: The least ratio that is asked for.
 TINY = 1e-9
 
-#: Effort of a decision that is not worth more.
-FEW = 100
+#: Relative, of the margin; and the largest factor by which a region may grow.
+MARGIN, LARGEST = 1e-4, 1e3
+
+#: Effort of a decision before it gives up, and of one that is not worth as much.
+MOST_BOXES, FEW = 20_000, 100
 
 #: Largest and smallest factor on the first guess that are tried.
 FAR = 1e9
@@ -96,8 +99,7 @@ def nonsingular(
     surface: Surface,
     region: Box,
     *,
-    tolerance: float = 1e-4,
-    max_boxes: int = 20_000,
+    max_boxes: int = MOST_BOXES,
 ) -> Verdict:
     """Decide whether the law exists all over a region, the general form of (37).
 
@@ -106,8 +108,6 @@ def nonsingular(
     region
         Coordinate name to (low, high), SI units, the target inside; coordinates left out
         stay at the target.
-    tolerance
-        Relative, of the margin.
     max_boxes
         Effort of a decision before it gives up.
 
@@ -128,7 +128,7 @@ def nonsingular(
     whole = (ratio for ratio in (1.0, 1 - 1e-12) if decide(ratio, FEW).kind == "proved")
     margin = next(whole, 0.0)
     if not margin and decide(TINY).kind == "proved":
-        margin = largest(decide, 0.5, tolerance, 1.0).proved or TINY
+        margin = largest(decide, 0.5, MARGIN, 1.0).proved or TINY
     found, claim = decide(margin or TINY), kernel.Nonsingular(box, Fraction(margin or TINY))
     if found.kind == "undecided":
         found = replace(found, why=f"{found.why}, gave up")
@@ -140,16 +140,12 @@ def singular_distance(
     surface: Surface,
     region: Box,
     *,
-    limit: float = 1e3,
     tolerance: float = 1e-6,
-    max_boxes: int = 20_000,
 ) -> tuple[float, float]:
     """Return by what factor a region may grow: proved non-singular, and refuted.
 
     Parameters
     ----------
-    limit
-        Largest factor tried.  Angles beyond ±π add nothing new, so it is also cut there.
     tolerance
         Relative gap between the two factors.
 
@@ -157,9 +153,10 @@ def singular_distance(
     -------
     proved, refuted : float
         The region scaled by ``proved`` is non-singular; scaled by ``refuted`` it is not
-        (``inf`` where no singularity is within the limit).
+        (``inf`` where no singularity is within the largest factor tried: 1000, or where an angle
+        is ±π, beyond which nothing is new).
     """
-    box = exact_region(mechanism, region)
+    limit, box = LARGEST, exact_region(mechanism, region)
     for c in mechanism.coordinates:
         reach = [float(abs(v)) for v in box.get(c.name, ()) if v]
         if c.unit == "rad" and reach:
@@ -169,7 +166,7 @@ def singular_distance(
     def decide(factor: float) -> kernel.Decision:
         exact = Fraction(factor)
         scaled = {k: (a * exact, b * exact) for k, (a, b) in box.items()}
-        return kernel.decide(model, law, kernel.Nonsingular(scaled, Fraction(TINY)), max_boxes)
+        return kernel.decide(model, law, kernel.Nonsingular(scaled, Fraction(TINY)), MOST_BOXES)
 
     found = largest(decide, 1.0, tolerance, limit)
     return found.proved, found.refuted

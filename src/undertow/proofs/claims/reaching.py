@@ -30,13 +30,16 @@ from undertow.law import ReachingLaw, Surface, check_surface_shape
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.claim import Box, Claim
 from undertow.proofs.claims.model_data import law_of, model_of
-from undertow.proofs.claims.nonsingular import Largest, exact_region, largest, nonsingular
+from undertow.proofs.claims.nonsingular import (
+    MOST_BOXES,
+    Largest,
+    exact_region,
+    largest,
+    nonsingular,
+)
 from undertow.proofs.claims.words import region_words, sentence, verdict_on
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.model import Law, Model
-
-#: Effort of a decision before it gives up.
-MOST_BOXES = 20_000
 
 
 @dataclass(frozen=True)
@@ -108,7 +111,6 @@ def reaching(
     eta: ArrayLike = 0.0,
     disturbance: Sequence[float] | None = None,
     tolerance: float = 1e-3,
-    max_boxes: int = MOST_BOXES,
 ) -> ReachingCertificate:
     """Prove the reaching condition (16) over a region of positions.
 
@@ -125,8 +127,6 @@ def reaching(
         Bounds |g_j| ≤ ḡ_j to be decided, (n,), N m or N; the mechanism's own by default.
     tolerance
         Relative gap between proved and refuted figures.
-    max_boxes
-        Effort of a decision before it gives up.
 
     Returns
     -------
@@ -143,8 +143,8 @@ def reaching(
     rate = _row("reaching rate η", eta, mechanism.m)
     own = mechanism.disturbance_bounds if disturbance is None else disturbance
     bounds = _row("disturbance bounds", own, mechanism.n)
-    condition = _Condition.of(mechanism, surface, region, gains, tolerance, max_boxes)
-    exists = nonsingular(mechanism, surface, region, max_boxes=max_boxes)
+    condition = _Condition.of(mechanism, surface, region, gains, tolerance)
+    exists = nonsingular(mechanism, surface, region)
     if not exists:
         why = f"the law is not shown to exist there: {exists.method}"
         said = sentence(condition.stated(bounds, rate), condition.model)
@@ -196,7 +196,6 @@ class _Condition:
     region: dict[str, tuple[Fraction, Fraction]]
     weights: FloatArray
     tolerance: float
-    max_boxes: int
 
     @classmethod
     def of(
@@ -206,12 +205,11 @@ class _Condition:
         region: Box,
         gains: ArrayLike | ReachingLaw | None,
         tolerance: float,
-        max_boxes: int,
     ) -> _Condition:
         """Write it for the kernel."""
         model, law = model_of(mechanism), _law(mechanism, surface, gains)
         box, weights = exact_region(mechanism, region), _at_target(mechanism, surface)
-        return cls(mechanism, model, law, box, weights, tolerance, max_boxes)
+        return cls(mechanism, model, law, box, weights, tolerance)
 
     def decide(
         self, bounds: Sequence[float] | FloatArray, rate: Sequence[float], more: float = 0.0
@@ -220,7 +218,7 @@ class _Condition:
         law = self.law
         if more:
             law = replace(law, eta=tuple(k + Fraction(more) for k in law.eta))
-        return kernel.decide(self.model, law, self.stated(bounds, rate), self.max_boxes)
+        return kernel.decide(self.model, law, self.stated(bounds, rate), MOST_BOXES)
 
     def stated(
         self, bounds: Sequence[float] | FloatArray, rate: Sequence[float]
@@ -300,7 +298,7 @@ class ReachingClaim(Claim):
 
     def decide(self, mechanism: Mechanism, surface: Surface, law: ReachingLaw) -> Verdict:
         """Decide it as :func:`reaching` does for the gains of the reaching law."""
-        condition = _Condition.of(mechanism, surface, self.region, law, 1e-3, MOST_BOXES)
+        condition = _Condition.of(mechanism, surface, self.region, law, 1e-3)
         return condition.verdict(self.disturbance, self.eta)
 
     def stated(self, mechanism: Mechanism, verdict: Verdict) -> kernel.Claim:
