@@ -337,7 +337,8 @@ class ClosedLoop:
         assert self.substeps > 0
         other = object.__new__(type(self))
         other.__dict__.update(
-            {k: v for k, v in vars(self).items() if k not in without | {"_alone"}}, **fields
+            {k: v for k, v in vars(self).items() if k not in without | {"_alone", "equations"}},
+            **fields,
         )
         return other
 
