@@ -153,8 +153,8 @@ def test_the_kernel_of_a_sampled_loop(interpreted: None, monkeypatch: pytest.Mon
     agree(agreement.kernel(subject, sampled=True))
     compiled = kernel.compile_loop
 
-    def renewed(*args: Any, sampled: bool) -> Any:
-        return compiled(*args, sampled=not sampled)
+    def renewed(loop: kernel.LoopEquations) -> Any:
+        return compiled(loop._replace(sampled=not loop.sampled))
 
     monkeypatch.setattr(agreement, "compile_loop", renewed)
     found = worst(agreement.kernel(subject, sampled=True))

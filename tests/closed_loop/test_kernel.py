@@ -30,7 +30,7 @@ from support import (
     runge_kutta,
 )
 from undertow.base import ArtefactError
-from undertow.closed_loop.kernel import build_loop_graph
+from undertow.closed_loop.kernel import LoopEquations, build_loop_graph
 from undertow.closed_loop.kernel_source import _hoist, kernel_source
 from undertow.law import Switching
 from undertow.models import TIME, FloatArray
@@ -185,7 +185,8 @@ def test_lines_are_computed_as_seldom_as_they_may(
     belief = ut.mechanisms.reaction_wheel_pendulum().with_disturbance_bounds(0.1, 0.1)
     plant = belief if wrong or many_plants else None
     objective = ut.MinimumEnergy(hard_input=hard_input)
-    program = build_loop_graph(belief, plant, objective, "tanh", many_plants=many_plants)
+    loop = LoopEquations(belief, plant, objective, "tanh", many_plants=many_plants)
+    program = build_loop_graph(loop)
     calls = {*program.plant_parameters, *program.belief_parameters, *program.limits}
     lanes = {*program.lane_inputs}
     outputs = [*program.demand, *program.s, program.singular, *program.derivative, program.stage]
@@ -332,10 +333,11 @@ import hashlib
 import undertow as ut
 from undertow.closed_loop.kernel_source import kernel_source
 from undertow.base import ArtefactError
-from undertow.closed_loop.kernel import build_loop_graph
+from undertow.closed_loop.kernel import LoopEquations, build_loop_graph
 rig = ut.mechanisms.rotary_pendulum()
-program = build_loop_graph(rig, rig.with_parameters(m=0.2), ut.MinimumEnergy(), "saturation")
-print(hashlib.sha256(kernel_source(program, sampled=False, header="").encode()).hexdigest())
+other = rig.with_parameters(m=0.2)
+program = build_loop_graph(LoopEquations(rig, other, ut.MinimumEnergy(), "saturation"))
+print(hashlib.sha256(kernel_source(program, header="").encode()).hexdigest())
 """
 
 
@@ -351,17 +353,17 @@ def test_source_does_not_depend_on_the_order_of_hashing() -> None:
         check=True,
     ).stdout.strip()
     rig = ut.mechanisms.rotary_pendulum()
-    program = build_loop_graph(rig, rig.with_parameters(m=0.2), ut.MinimumEnergy(), "saturation")
-    source = kernel_source(program, sampled=False, header="")
+    other = rig.with_parameters(m=0.2)
+    program = build_loop_graph(LoopEquations(rig, other, ut.MinimumEnergy(), "saturation"))
+    source = kernel_source(program, header="")
     assert hashlib.sha256(source.encode()).hexdigest() == printed
 
 
 def test_lane_loops_have_no_branches_and_the_source_fits_the_block() -> None:
     """Inside a lane loop everything is an expression: that is what lets it be vectorised."""
     rig = ut.mechanisms.rotary_pendulum()
-    source = kernel_source(
-        build_loop_graph(rig, None, ut.MinimumEnergy(), "saturation"), sampled=False, header=""
-    )
+    loop = LoopEquations(rig, None, ut.MinimumEnergy(), "saturation")
+    source = kernel_source(build_loop_graph(loop), header="")
     lines = source.splitlines()
     heads = [i for i, line in enumerate(lines) if re.match(r"\s*for i(__\d+)? in range\(", line)]
     assert len(heads) >= 18

@@ -18,7 +18,7 @@ import sympy as sp
 import undertow as ut
 from undertow.base import ModelError
 from undertow.base.errors import CertificateError
-from undertow.proofs.claims import words
+from undertow.proofs.claims import terminal_ellipsoid, words
 from undertow.proofs.claims.certificate import Certificate
 from undertow.proofs.claims.document import document_bytes
 from undertow.proofs.claims.model_data import law_of, model_data, model_of
@@ -285,7 +285,7 @@ def test_the_ball_of_an_ellipsoid_is_the_largest_inside() -> None:
     for size in (1e-3, 1.0, 1e3):
         W = size * np.random.default_rng(4).normal(size=(4, 4))
         exact = tuple(tuple(Fraction(v) for v in row) for row in W)
-        found = words.ball(kernel.TerminalEllipsoid(exact, Fraction(2)))
+        found = terminal_ellipsoid.ball(kernel.TerminalEllipsoid(exact, Fraction(2)))
         largest = 2 / np.linalg.norm(W, 2)
         assert (1 - 1e-9) * largest < found <= largest
 
@@ -339,7 +339,7 @@ def test_a_region_on_one_side_of_the_target_is_said(ends: tuple[float, float], s
     positions = Quantity("theta", "rad"), Quantity("phi", "rad")
     box = {"theta": (Fraction(0), Fraction(0)), "phi": (Fraction(ends[0]), Fraction(ends[1]))}
     rest = ", the other coordinates at the target" if any(ends) else ""
-    assert words.region(positions, box) == said + rest
+    assert words.region_words(positions, box) == said + rest
 
 
 def test_a_file_has_no_sentence_to_believe() -> None:

@@ -54,9 +54,9 @@ def generations(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     names: list[str] = []
     original = kernel.build_loop_graph
 
-    def counted(belief: ut.Mechanism, *rest: Any, **more: Any) -> Any:
-        names.append(belief.name)
-        return original(belief, *rest, **more)
+    def counted(loop: kernel.LoopEquations) -> Any:
+        names.append(loop.belief.name)
+        return original(loop)
 
     def not_compiled(name: str, source: str) -> Any:
         return type("Module", (), {"rollout": staticmethod(lambda: source)})
@@ -69,7 +69,7 @@ def generations(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def source(*arguments: Any) -> str:
     """Source of a kernel as a new process would find or write it."""
     kernel.compile_loop.cache_clear()
-    return str(kernel.compile_loop(*arguments).rollout())
+    return str(kernel.compile_loop(kernel.LoopEquations(*arguments)).rollout())
 
 
 # -- equations -----------------------------------------------------------------------------------

@@ -7,7 +7,6 @@ a function of its arguments, so a recorded run can be replayed.  The runtime, or
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -26,7 +25,7 @@ from undertow.base import (
 )
 from undertow.cascade.judge import Judge
 from undertow.cascade.planners import Planners, searched
-from undertow.cascade.planning import first_plan, holding_plan, next_plan
+from undertow.cascade.planning import Planning
 from undertow.cascade.predictions import Predictions
 from undertow.cascade.reserve import Reserve
 from undertow.cascade.simulation import (
@@ -284,10 +283,6 @@ class Cascade:
         )  # fmt: skip
 
     @cached_property
-    def _planners(self) -> Planners:
-        return Planners(self.predictions, self.optimiser, self.planner, self.recourse)
-
-    @cached_property
     def _reserve(self) -> Reserve:
         return Reserve(self.optimiser.anchor, self.reaching, self.period)
 
@@ -299,6 +294,11 @@ class Cascade:
     @cached_property
     def _judge(self) -> Judge:
         return Judge(self.predictions, self._reserve, self.gate, self.objective, self.recourse)
+
+    @cached_property
+    def _planning(self) -> Planning:
+        planners = Planners(self.predictions, self.optimiser, self.planner, self.recourse)
+        return Planning(planners, self._judge, self.resolution)
 
     # -- what it knows ----------------------------------------------------------------------
 
@@ -430,15 +430,10 @@ class Cascade:
         target: ReferenceMotion | None = None,
         t: float = 0.0,
         before: CascadeState | None = None,
-        longest: float = math.inf,
     ) -> tuple[CascadeState, Proposal]:
-        """:meth:`start`, or :meth:`retarget` from ``before``, to a leg that was checked before.
-
-        The first plan is to arrive within ``longest``, s, where one does, else within the
-        objective's horizon.
-        """
+        """:meth:`start`, or :meth:`retarget` from ``before``, to a leg that was checked before."""
         instant(t)
-        return first_plan(self._planners, self._judge, x, target, t, before, longest)
+        return self._planning.first(x, target, t, before)
 
     @checked
     def first_admission(self, state: CascadeState, x: ArrayLike, horizon: float) -> Admission:
@@ -509,7 +504,7 @@ class Cascade:
         target at rest where it is at the time t.  :meth:`apply_gate` sees the motion.
         """
         instant(t)
-        return next_plan(self._planners, self._judge, self.resolution, state, x, t, horizon)
+        return self._planning.next(state, x, t, horizon)
 
     @checked
     def apply_gate(
@@ -624,7 +619,7 @@ class Cascade:
         memory: CascadeState | None = None
         planned_with: ParameterEstimate | None = None
         truth, task, arrived = plants[0], -1, False
-        holding = self._planners.holding
+        holding = self._planning.planners.holding
         spent = since = 0.0  # cost since the last decision; when it was last at the target, s
         for leg, t, span, due in moments(self, legs, plants):
             truth = plants.get(round(t / self.stride), truth)
@@ -633,22 +628,18 @@ class Cascade:
             if t == leg.begin or home or arrived:  # to leave what was reached begins another task
                 since = t
             if memory is None or t == leg.begin:
-                memory, proposal = first_plan(
-                    self._planners, self._judge, x, leg.target, t, memory, leg.longest
-                )
+                memory, proposal = self._planning.first(x, leg.target, t, memory, leg.longest)
                 admission = self.first_admission(memory, x, leg.longest)
             elif home:
                 if leg.stays:
-                    proposal = holding_plan(self._planners, memory, memory.error(t, x), t)
+                    proposal = self._planning.hold(memory, memory.error(t, x), t)
                 if proposal is not None:
                     memory, admission = self.apply_gate(memory, proposal, x, leg.longest)
             elif due or is_news(planned_with, memory.estimate) or not self.survives(memory, x, t):
                 left = leg.longest - (t - since)
                 if left <= 0.5 * self.step:  # a disturbed plant came too late: a new horizon
                     since, left = t, leg.longest
-                proposal = next_plan(
-                    self._planners, self._judge, self.resolution, memory, x, t, left
-                )
+                proposal = self._planning.next(memory, x, t, left)
                 memory, admission = self.apply_gate(memory, proposal, x, left)
             if proposal is not None:
                 begins = t == leg.begin or not home  # to hold what was reached begins no task

@@ -1,4 +1,4 @@
-"""The searches for the first plan of a task, and for the next ones."""
+"""The searches for the first plan of a task, for the next ones, and for what holds a target."""
 
 from __future__ import annotations
 
@@ -51,141 +51,215 @@ class Found(NamedTuple):
     proposal: Proposal
 
 
-def first_plan(
-    planners: Planners,
-    judge: Judge,
-    x: FloatArray,
-    target: ReferenceMotion | None = None,
-    t: float = 0.0,
-    before: CascadeState | None = None,
-    longest: float = math.inf,
-) -> tuple[CascadeState, Proposal]:
-    """Search for the first plan from a state x at the time t, to a target that was checked before.
+class Planning:
+    """The searches of a cascade.
 
-    The plan is to arrive within ``longest``, s, where one does, else within the objective's
-    horizon.  What ``before`` remembers of the plant is kept.
-
-    Raises
-    ------
-    InfeasibleError
-        When no admissible plan was found, or the inputs cannot hold the target.
+    Parameters
+    ----------
+    planners, judge
+        Who is asked for plans, and who decides on them.
+    resolution
+        Differences in cost below this part of the first cost are not worth a search.
     """
-    predictions, belief = planners.predictions, planners.predictions.belief
-    absolute, horizon = x, min(longest, judge.objective.horizon)
-    short = horizon < judge.objective.horizon
-    if target is not None:
-        x = predictions.prior.mechanism.check_state(x) - target.state(t)
-    number, known = 0, None if belief is None else belief.prior
-    if before is not None:
-        number, known = before.sequence + 1, before.estimate or known
-    whole = predictions.plausible(known)
-    here = predictions.about(whole, target, t)
-    here.objective.check_start(here.mechanism, x)
-    check_held(predictions.prior)
-    # Where nothing suits every plausible plant, what brings home the estimate, without room for
-    # any error: to learn which of the plants it is takes less time than to fall.
-    single = None
-    if belief is not None and known is not None:
-        single = whole.believing(whole.mechanism, belief.single(known))
-    last = [] if single is None else [Search(single)]
-    tries: list[Found] = []
-    for loop, fixed, repairs in [*_first_searches(planners, known), *last]:
-        found = tries[-1].proposal if tries else None
-        if loop is single and found is not None and found.plan is not None:
-            break
-        about, planner = predictions.about(loop, target, t), planners.of(loop, target, t)
-        if fixed is not None:
-            planner = planners.suited(fixed).on(predictions.about(fixed, target, t))
-        span = horizon if short else None
-        if repairs and found is not None and isinstance(planner, Optimiser):
-            proposal = planner.repair(x, found, horizon=span)
-        else:
-            proposal = planner.propose(
-                x, incumbent=None, horizon=span, sequence=0, computed_for=t, resolution=0.0
-            )
-        plan = proposal.plan
-        if plan is None:
-            tries.append(Found(3, math.inf, proposal))
-            continue
-        cost = float(about.batch(x, plan, duration=horizon, precise=True).score(horizon)[0])
-        cost = cost if cost < INADMISSIBLE else math.inf
+
+    def __init__(self, planners: Planners, judge: Judge, resolution: float) -> None:
+        self.planners, self.judge, self.resolution = planners, judge, resolution
+        self.predictions = planners.predictions
+
+    def first(
+        self,
+        x: FloatArray,
+        target: ReferenceMotion | None = None,
+        t: float = 0.0,
+        before: CascadeState | None = None,
+        longest: float = math.inf,
+    ) -> tuple[CascadeState, Proposal]:
+        """Search for the first plan from a state x at the time t, to a target that was checked.
+
+        The plan is to arrive within ``longest``, s, where one does, else within the objective's
+        horizon.  What ``before`` remembers of the plant is kept.
+
+        Raises
+        ------
+        InfeasibleError
+            When no admissible plan was found, or the inputs cannot hold the target.
+        """
+        planners, judge, predictions = self.planners, self.judge, self.predictions
+        belief = predictions.belief
+        absolute, horizon = x, min(longest, judge.objective.horizon)
+        short = horizon < judge.objective.horizon
+        if target is not None:
+            x = predictions.prior.mechanism.check_state(x) - target.state(t)
+        number, known = 0, None if belief is None else belief.prior
+        if before is not None:
+            number, known = before.sequence + 1, before.estimate or known
+        whole = predictions.plausible(known)
+        here = predictions.about(whole, target, t)
+        here.objective.check_start(here.mechanism, x)
+        check_held(predictions.prior)
+        # Where nothing suits every plausible plant, what brings home the estimate, without room for
+        # any error: to learn which of the plants it is takes less time than to fall.
+        single = None
+        if belief is not None and known is not None:
+            single = whole.believing(whole.mechanism, belief.single(known))
+        last = [] if single is None else [Search(single)]
+        tries: list[Found] = []
+        for loop, fixed, repairs in [*self._searches(known), *last]:
+            found = tries[-1].proposal if tries else None
+            if loop is single and found is not None and found.plan is not None:
+                break
+            about, planner = predictions.about(loop, target, t), planners.of(loop, target, t)
+            if fixed is not None:
+                planner = planners.suited(fixed).on(predictions.about(fixed, target, t))
+            span = horizon if short else None
+            if repairs and found is not None and isinstance(planner, Optimiser):
+                proposal = planner.repair(x, found, horizon=span)
+            else:
+                proposal = planner.propose(
+                    x, incumbent=None, horizon=span, sequence=0, computed_for=t, resolution=0.0
+                )
+            plan = proposal.plan
+            if plan is None:
+                tries.append(Found(3, math.inf, proposal))
+                continue
+            cost = float(about.batch(x, plan, duration=horizon, precise=True).score(horizon)[0])
+            cost = cost if cost < INADMISSIBLE else math.inf
+            begun = CascadeState(plan, number, cost, cost, t, as_numbers(x), known, target)
+            good = math.isfinite(cost) and math.isinf(judge.breaks(begun, [plan], x, horizon)[0][0])
+            if loop is not whole:  # every plausible plant lives to see the next decision
+                lives = judge.survives if loop.ensemble is not None else judge.reserve.recovers
+                good &= lives(here, x, plan)
+            if loop.ensemble is None and planners.own is None:
+                good &= cost <= AGREES * proposal.cost
+            tries.append(Found(0 if good else 1 if loop is whole else 2, cost, proposal))
+            if good:
+                break
+        best = min(tries, key=lambda one: (one.rank, one.cost))
+        if best.proposal.plan is None and short:
+            return self.first(absolute, target, t, before)
+        cost, proposal = best.cost, best.proposal
+        plan = proposal.required(here, x).plan
+        assert plan is not None  # required
+        if target is not None and target.moves:  # or the designed surface, where that is better
+            plans = [plan, Plan.of(planners.optimiser.anchor)]
+            costs = costs_along(whole, x, plans, target, t, horizon)
+            k = int(np.argmin(costs))
+            plan, cost = plans[k], costs[k]
         begun = CascadeState(plan, number, cost, cost, t, as_numbers(x), known, target)
-        good = math.isfinite(cost) and math.isinf(judge.breaks(begun, [plan], x, horizon)[0][0])
-        if loop is not whole:  # every plausible plant lives to see the next decision
-            lives = judge.survives if loop.ensemble is not None else judge.reserve.recovers
-            good &= lives(here, x, plan)
-        if loop.ensemble is None and planners.own is None:
-            good &= cost <= AGREES * proposal.cost
-        tries.append(Found(0 if good else 1 if loop is whole else 2, cost, proposal))
-        if good:
-            break
-    best = min(tries, key=lambda one: (one.rank, one.cost))
-    if best.proposal.plan is None and short:
-        return first_plan(planners, judge, absolute, target, t, before)
-    cost, proposal = best.cost, best.proposal
-    plan = proposal.required(here, x).plan
-    assert plan is not None  # required
-    if target is not None and target.moves:  # or the designed surface, where that is better
-        plans = [plan, Plan.of(planners.optimiser.anchor)]
-        costs = costs_along(whole, x, plans, target, t, horizon)
-        k = int(np.argmin(costs))
-        plan, cost = plans[k], costs[k]
-    begun = CascadeState(plan, number, cost, cost, t, as_numbers(x), known, target)
-    mends = planners.recourse and planners.own is None
-    if mends and best.rank < 3 and not (target is not None and target.moves):
-        begun = replace(begun, ahead=_ahead(planners, judge, begun, x, horizon))
-    return begun, replace(proposal, sequence=number)
+        mends = planners.recourse and planners.own is None
+        if mends and best.rank < 3 and not (target is not None and target.moves):
+            begun = replace(begun, ahead=self._ahead(begun, x, horizon))
+        return begun, replace(proposal, sequence=number)
 
+    def _ahead(self, begun: CascadeState, x: FloatArray, span: float) -> Plan | None:
+        """What will be best for the estimate at the next decision; ``None`` without any such plan.
 
-def _ahead(
-    planners: Planners, judge: Judge, begun: CascadeState, x: FloatArray, span: float
-) -> Plan | None:
-    """What will be best for the estimate at the next decision; ``None`` without any such plan.
+        That decision has no time to search for it from nothing.
+        """
+        predictions, period = self.predictions, self.judge.period
+        estimated = predictions.estimated_at(begun)
+        motion = estimated.batch(x, begun.plan, duration=period, terminal=0.0)
+        there = motion.radius[0] <= self.judge.objective.terminal_radius
+        if there or motion.event[0] != Event.HORIZON or span <= period:
+            return None
+        known = predictions.estimated(begun.estimate)
+        optimiser = self.planners.optimiser_of(known, begun.target, begun.since)
+        return optimiser.propose(motion.x[0], horizon=span - period).plan
 
-    That decision has no time to search for it from nothing.
-    """
-    predictions, period = judge.predictions, judge.period
-    estimated = predictions.estimated_at(begun)
-    motion = estimated.batch(x, begun.plan, duration=period, terminal=0.0)
-    there = motion.radius[0] <= judge.objective.terminal_radius
-    if there or motion.event[0] != Event.HORIZON or span <= period:
-        return None
-    known = predictions.estimated(begun.estimate)
-    optimiser = planners.optimiser_of(known, begun.target, begun.since)
-    return optimiser.propose(motion.x[0], horizon=span - period).plan
+    def _searches(self, estimate: ParameterEstimate | None) -> list[Search]:
+        """What the first plan is to be best on, one after the other.
 
+        Before anything has moved, what suits every plausible plant suits none of them well: the
+        estimate alone comes first, for a plan that the next decision replaces; a schedule for it
+        without any error before.  Where its plan does not do what it promised, small steps
+        throughout follow: for one plant, which is integrated to the tolerance, smaller ones than
+        usual.  With many plants and a smooth cost that plan is repaired first: what costs least
+        goes up to a bound, and small steps may find it broken by a hair.
+        """
+        planners, predictions = self.planners, self.predictions
+        belief = predictions.belief
+        whole = predictions.plausible(estimate)
+        if planners.own is not None:
+            return [Search(whole)]
+        loops = [whole]
+        if belief is not None and estimate is not None:
+            loops.insert(0, whole.believing(whole.mechanism, belief.alone(estimate)))
+        if planners.recourse and planners.optimiser.freedom.schedule:
+            loops.insert(0, predictions.estimated(estimate))
 
-def _first_searches(planners: Planners, estimate: ParameterEstimate | None) -> list[Search]:
-    """What the first plan is to be best on, one after the other.
+        def smaller(loop: ClosedLoop) -> ClosedLoop:
+            adapts = loop.ensemble is None and not loop.zoh_steps
+            return loop.with_steps(predictions.prior.step / FINER, 0.0) if adapts else loop
 
-    Before anything has moved, what suits every plausible plant suits none of them well: the
-    estimate alone comes first, for a plan that the next decision replaces; a schedule for it
-    without any error before.  Where its plan does not do what it promised, small steps
-    throughout follow: for one plant, which is integrated to the tolerance, smaller ones than
-    usual.  With many plants and a smooth cost that plan is repaired first: what costs least goes up
-    to a bound, and small steps may find it broken by a hair.
-    """
-    predictions, belief = planners.predictions, planners.predictions.belief
-    whole = predictions.plausible(estimate)
-    if planners.own is not None:
-        return [Search(whole)]
-    loops = [whole]
-    if belief is not None and estimate is not None:
-        loops.insert(0, whole.believing(whole.mechanism, belief.alone(estimate)))
-    if planners.recourse and planners.optimiser.freedom.schedule:
-        loops.insert(0, predictions.estimated(estimate))
+        searches = []
+        for loop in loops:
+            small = smaller(loop)
+            smooth = loop.ensemble is not None and not loop.price_of_time
+            repaired = [Search(loop, small, repairs=True)] if smooth else []
+            searches += [Search(loop), *repaired, Search(loop, small)]
+        return searches
 
-    def smaller(loop: ClosedLoop) -> ClosedLoop:
-        adapts = loop.ensemble is None and not loop.zoh_steps
-        return loop.with_steps(predictions.prior.step / FINER, 0.0) if adapts else loop
+    def hold(self, state: CascadeState, error: FloatArray, t: float) -> Proposal | None:
+        """The plan that holds what was reached, at no cost; ``None``: see :class:`Holding`.
 
-    searches = []
-    for loop in loops:
-        small = smaller(loop)
-        smooth = loop.ensemble is not None and not loop.price_of_time
-        repaired = [Search(loop, small, repairs=True)] if smooth else []
-        searches += [Search(loop), *repaired, Search(loop, small)]
-    return searches
+        A planner of one's own decides for itself.
+        """
+        own = self.planners.own
+        plan = None if own is not None else self.planners.holding.best(state, error, t)
+        if plan is None:
+            return None
+        return Proposal(plan, "converged", 0.0, 0.0, (), 1, 0.0, state.sequence + 1, t)
+
+    def next(self, state: CascadeState, x: ArrayLike, t: float, horizon: float | None) -> Proposal:
+        """Re-optimise from a state x at the time t; an exception becomes a status.
+
+        See :meth:`undertow.Cascade.propose`.
+        """
+        planners, judge, predictions = self.planners, self.judge, self.predictions
+        sequence = state.sequence + 1
+        try:
+            error = state.error(t, predictions.prior.mechanism.check_state(x))
+            span = judge.objective.horizon if horizon is None else horizon
+            here, loop, used = replace(state, since=t), predictions.at(state, t), state.at(t)
+            ask: dict[str, Any] = {
+                "horizon": horizon,
+                "sequence": sequence,
+                "computed_for": t,
+                "resolution": self.resolution * state.scale,
+            }
+            if planners.recourse:
+                estimated = predictions.estimated(state.estimate)
+                optimiser = planners.optimiser_of(estimated, state.target, t)
+                admits = partial(judge.reserve.recovers, loop, error)
+                first = state.predicted == state.scale  # nothing was decided since
+                spent = (t - state.since) * loop.price_of_time
+                promised = 0.0 if first else state.predicted - spent
+                begins = [(used, promised)]
+                if state.ahead is not None:
+                    begins.append((state.ahead, math.inf))
+                answers: list[Proposal] = []
+                mended: list[Proposal] = []
+                scheduled = optimiser.freedom.schedule > 0
+                # Of single surfaces the best one mostly is admissible; asking all takes long.
+                for asked in (admits,) if scheduled else (None, admits):
+                    for plan, cost in begins if not mended else ():
+                        found = optimiser.propose(
+                            error, incumbent=plan, admits=asked, promised=cost, **ask
+                        )
+                        answers.append(found)
+                        if found.plan and judge.mendable(here, loop, found.plan, error, span):
+                            mended.append(found)
+                if mended or judge.mendable(here, loop, used, error, span):
+                    return _best_of(mended or answers[:1], answers)
+            planner = planners.of(predictions.plausible(state.estimate), state.target, t)
+            standing = judge.standing(here, loop, used, error, span)
+            # What suits all plants may be near a plan that is late on one of them.
+            plans = [standing] if standing is used else [standing, used]
+            near = [planner.propose(error, incumbent=plan, **ask) for plan in plans]
+            return _best_of(near, near)
+        except Exception as error:  # the inner loop must survive whatever the outer loop does
+            said = error_text(error)
+            return Proposal(None, "failed", math.inf, math.inf, (), 0, 0.0, sequence, t, said)
 
 
 def _best_of(answers: list[Proposal], asked: list[Proposal]) -> Proposal:
@@ -202,75 +276,3 @@ def _best_of(answers: list[Proposal], asked: list[Proposal]) -> Proposal:
         evaluations=sum(one.evaluations for one in asked),
         seconds=sum(one.seconds for one in asked),
     )
-
-
-def holding_plan(
-    planners: Planners, state: CascadeState, error: FloatArray, t: float
-) -> Proposal | None:
-    """The plan that holds what was reached, at no cost; ``None``: see :class:`Holding`.
-
-    A planner of one's own decides for itself.
-    """
-    plan = planners.holding.best(state, error, t) if planners.own is None else None
-    if plan is None:
-        return None
-    return Proposal(plan, "converged", 0.0, 0.0, (), 1, 0.0, state.sequence + 1, t)
-
-
-def next_plan(
-    planners: Planners,
-    judge: Judge,
-    resolution: float,
-    state: CascadeState,
-    x: ArrayLike,
-    t: float,
-    horizon: float | None,
-) -> Proposal:
-    """Re-optimise from a state x at the time t; an exception becomes a status.
-
-    See :meth:`undertow.Cascade.propose`.
-    """
-    predictions, sequence = planners.predictions, state.sequence + 1
-    try:
-        error = state.error(t, predictions.prior.mechanism.check_state(x))
-        span = judge.objective.horizon if horizon is None else horizon
-        here, loop, used = replace(state, since=t), predictions.at(state, t), state.at(t)
-        ask: dict[str, Any] = {
-            "horizon": horizon,
-            "sequence": sequence,
-            "computed_for": t,
-            "resolution": resolution * state.scale,
-        }
-        if planners.recourse:
-            estimated = predictions.estimated(state.estimate)
-            optimiser = planners.optimiser_of(estimated, state.target, t)
-            admits = partial(judge.reserve.recovers, loop, error)
-            first = state.predicted == state.scale  # nothing was decided since
-            spent = (t - state.since) * loop.price_of_time
-            promised = 0.0 if first else state.predicted - spent
-            begins = [(used, promised)]
-            if state.ahead is not None:
-                begins.append((state.ahead, math.inf))
-            answers: list[Proposal] = []
-            mended: list[Proposal] = []
-            scheduled = optimiser.freedom.schedule > 0
-            # Of single surfaces the best one mostly is admissible; asking all takes long.
-            for asked in (admits,) if scheduled else (None, admits):
-                for plan, cost in begins if not mended else ():
-                    found = optimiser.propose(
-                        error, incumbent=plan, admits=asked, promised=cost, **ask
-                    )
-                    answers.append(found)
-                    if found.plan and judge.mendable(here, loop, found.plan, error, span):
-                        mended.append(found)
-            if mended or judge.mendable(here, loop, used, error, span):
-                return _best_of(mended or answers[:1], answers)
-        planner = planners.of(predictions.plausible(state.estimate), state.target, t)
-        standing = judge.standing(here, loop, used, error, span)
-        # What suits all plants may be near a plan that is late on one of them.
-        plans = [standing] if standing is used else [standing, used]
-        found_near = [planner.propose(error, incumbent=plan, **ask) for plan in plans]
-        return _best_of(found_near, found_near)
-    except Exception as error:  # the inner loop must survive whatever the outer loop does
-        said = error_text(error)
-        return Proposal(None, "failed", math.inf, math.inf, (), 0, 0.0, sequence, t, said)

@@ -226,8 +226,8 @@ def kernel(subject: Subject, *, sampled: bool = False) -> Iterator[Difference]:
     """
     mechanism, model = subject.mechanism, subject.model
     n, m, objective = mechanism.n, mechanism.m, MinimumEnergy().on(mechanism)
-    kernels = compile_loop(mechanism, None, objective, subject.reaching.switching, sampled=sampled)
     loop = ClosedLoop(mechanism, objective, subject.reaching, step=STEP, zoh_steps=int(sampled))
+    kernels = compile_loop(loop.equations)
     buffers = RolloutBuffers(loop, len(subject.states), 1)
     buffers.fill(subject.states, subject.surface.vector)
     record = np.zeros((buffers.padded, 1, 2 * n + 2 * m + 2))

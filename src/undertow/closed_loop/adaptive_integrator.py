@@ -347,7 +347,7 @@ def follow() -> Any:
     return compiled(signature)(_follow)
 
 
-def look_source(program: LoopGraph, *, sampled: bool, header: str) -> str:
+def look_source(program: LoopGraph, *, header: str) -> str:
     """Return the source of a module with ``look`` and ``decide`` of a closed loop.
 
     ``decide`` evaluates the law at a state: u, and into ``seen`` s, demand, det Γ(q)/det Γ(0), the
@@ -358,8 +358,6 @@ def look_source(program: LoopGraph, *, sampled: bool, header: str) -> str:
     ----------
     program
         The closed loop.
-    sampled
-        Whether the input is held between samples.
     header
         Text for the module's docstring.
     """
@@ -368,7 +366,7 @@ def look_source(program: LoopGraph, *, sampled: bool, header: str) -> str:
     seen = [*program.s, *program.demand, program.singular, margin]
     rates = [*program.derivative, program.stage]
     law, law_needs = emit.lines(seen, set())
-    known = set() if sampled else {line.symbol for line in program.tape.live(seen)}
+    known = set() if program.sampled else {line.symbol for line in program.tape.live(seen)}
     flow, flow_needs = emit.lines([*rates, *program.path], known)
     places = {program.time: "t"} | {
         symbol: f"{argument}[{j}]"
@@ -404,8 +402,8 @@ def look_source(program: LoopGraph, *, sampled: bool, header: str) -> str:
     ]
     looked = [*loads(flow_needs | law_needs), *decided, *moved]
     functions = {
-        "decide": [*loads(law_needs), *decided] if sampled else ["pass"],
-        "look": [*loads(flow_needs), *moved] if sampled else looked,
+        "decide": [*loads(law_needs), *decided] if program.sampled else ["pass"],
+        "look": [*loads(flow_needs), *moved] if program.sampled else looked,
     }
     return f"{docstring(header)}{PREAMBLE}" + "".join(
         f"\n\n@numba.njit({_LOOK}, cache=True, nogil=True, error_model='numpy', "

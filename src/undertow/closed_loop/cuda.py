@@ -91,15 +91,7 @@ class CudaText:
     """
 
     def __init__(self, loop: ClosedLoop) -> None:
-        graph = build_loop_graph(
-            loop.mechanism,
-            loop._given,
-            loop.objective,
-            loop.reaching.switching,
-            sampled=loop.zoh_steps > 0,
-            many_plants=loop.ensemble is not None,
-        )
-        source = kernel_source(graph, sampled=loop.zoh_steps > 0, header="")
+        source = kernel_source(build_loop_graph(loop.equations), header="")
         kinds = {"from_lane": "long long", "to_lane": "long long", **PARAMETERS}
         made = Translation(source, "rollout", kinds, BLOCK)
         self.text, self.shapes = made.text, made.shapes

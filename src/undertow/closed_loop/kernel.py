@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import sympy as sp
 
@@ -17,32 +17,57 @@ from undertow.objective import Objective
 from undertow.symbolic import Tape, content_key, generated
 
 
-def slides(switching: Switching, *, sampled: bool) -> bool:
-    """Whether a law is discontinuous and acts in continuous time: it does not chatter."""
-    return switching == "sign" and not sampled
+class LoopEquations(NamedTuple):
+    """What a closed loop's kernels are written from: all of it but the values of its numbers.
+
+    Without a ``plant`` belief and plant share symbols, so everything they have in common is
+    computed once; otherwise the belief keeps its own parameter symbols.  With ``many_plants`` each
+    lane brings the parameters of its plant.
+    """
+
+    belief: Mechanism
+    plant: Mechanism | None
+    objective: Objective
+    switching: Switching
+    sampled: bool = False
+    many_plants: bool = False
+
+    @property
+    def truth(self) -> Mechanism:
+        """The plant that moves."""
+        return self.belief if self.plant is None else self.plant
+
+    @property
+    def slides(self) -> bool:
+        """Whether the law is discontinuous and acts in continuous time: it does not chatter."""
+        return self.switching == "sign" and not self.sampled
+
+    @property
+    def key(self) -> str:
+        """What tells the kernels' source from any other, for the cache on disk."""
+        truth, objective = self.truth, self.objective
+        return content_key(
+            self.belief.structure,
+            "the belief" if self.plant is None else self.plant.structure,
+            sp.srepr([objective.stage_cost(truth), *objective.path_margins(truth)]),
+            repr((self.belief.name, objective.name, objective.hard_input, self.switching,
+                  self.sampled, LANES)),
+            "many plants" if self.many_plants else "",
+            repr(objective.boxes(truth)),
+        )  # fmt: skip
 
 
-def build_loop_graph(
-    belief: Mechanism,
-    plant: Mechanism | None,
-    objective: Objective,
-    switching: Switching,
-    *,
-    sampled: bool = False,
-    many_plants: bool = False,
-) -> LoopGraph:
+def build_loop_graph(loop: LoopEquations) -> LoopGraph:
     """Compose law, plant and objective on one tape.
 
-    With ``plant=None`` both share symbols, so everything they have in common is computed
-    once; otherwise the belief keeps its own parameter symbols.  With ``many_plants`` each lane
-    brings the parameters of its plant.  Unless it is ``sampled``, a discontinuous law acts in
-    continuous time: it slides, and its lanes bring the length of a step in the places of ε.
+    Unless it is sampled, a discontinuous law acts in continuous time: it slides, and its lanes
+    bring the length of a step in the places of ε.
     """
-    truth = belief if plant is None else plant
+    belief, truth, objective = loop.belief, loop.truth, loop.objective
     x = truth.x
     rename: dict[sp.Symbol, sp.Expr] = dict(zip(belief.x, x, strict=True))
     belief_parameters: tuple[sp.Symbol, ...] = ()
-    if plant is not None:
+    if loop.plant is not None:
         belief_parameters = tuple(
             sp.Symbol(f"_belief_{s}", real=True) for s in belief.parameter_symbols
         )
@@ -50,12 +75,12 @@ def build_loop_graph(
     symbols = LawSymbols.of(belief.n, belief.m)
     applied = tuple(sp.Symbol(f"_applied_{i}", real=True) for i in range(truth.m))
     limits = tuple(sp.Symbol(f"_limit_{i}", real=True) for i in range(truth.m))
-    plant_parameters = () if many_plants else truth.parameter_symbols
-    lane_inputs = (*symbols.vector, *(truth.parameter_symbols if many_plants else ()))
+    plant_parameters = () if loop.many_plants else truth.parameter_symbols
+    lane_inputs = (*symbols.vector, *(truth.parameter_symbols if loop.many_plants else ()))
     tape = Tape([*plant_parameters, *belief_parameters, *limits, *lane_inputs])
     law = build_law_graph(
-        belief.partition(tape, rename), x, symbols, switching, belief.disturbance_bounds,
-        implicit=slides(switching, sampled=sampled),
+        belief.partition(tape, rename), x, symbols, loop.switching, belief.disturbance_bounds,
+        implicit=loop.slides,
     )  # fmt: skip
     inputs = dict(zip(truth.u, applied, strict=True))
     qdd = truth.partition(tape).accelerations(sp.Matrix(applied))
@@ -83,67 +108,34 @@ def build_loop_graph(
         path=tuple(path),
         input_margin=input_margin,
         boxes=objective.boxes(truth),
+        sampled=loop.sampled,
     )
 
 
 @lru_cache(maxsize=64)
-def compile_loop(
-    belief: Mechanism,
-    plant: Mechanism | None,
-    objective: Objective,
-    switching: Switching,
-    sampled: bool,
-    many_plants: bool = False,
-) -> Any:
+def compile_loop(loop: LoopEquations) -> Any:
     """Return the kernel of a closed loop, from the cache where it is known.
 
     A module with the functions ``rollout`` and, for continuous loops, ``etd_integrate``; each is
     compiled when it is first called.
     """
-    given = belief, plant, objective, switching, sampled, many_plants
-    return _generated("loop", kernel_source, *given)
+    return _generated("loop", kernel_source, loop)
 
 
 @lru_cache(maxsize=64)
-def compile_look(
-    belief: Mechanism,
-    plant: Mechanism | None,
-    objective: Objective,
-    switching: Switching,
-    sampled: bool,
-) -> Any:
+def compile_look(loop: LoopEquations) -> Any:
     """Return a closed loop as :func:`undertow.closed_loop.adaptive_integrator.follow` wants it.
 
     A module with the functions ``look`` and ``decide``, compiled.
     """
-    return _generated("look", look_source, belief, plant, objective, switching, sampled, False)
+    return _generated("look", look_source, loop)
 
 
-def _generated(
-    kind: str,
-    source: Callable[..., str],
-    belief: Mechanism,
-    plant: Mechanism | None,
-    objective: Objective,
-    switching: Switching,
-    sampled: bool,
-    many_plants: bool,
-) -> Any:
-    truth = belief if plant is None else plant
-    key = content_key(
-        belief.structure,
-        "the belief" if plant is None else plant.structure,
-        sp.srepr([objective.stage_cost(truth), *objective.path_margins(truth)]),
-        repr((belief.name, objective.name, objective.hard_input, switching, sampled, LANES)),
-        "many plants" if many_plants else "",
-        repr(objective.boxes(truth)),
-    )
+def _generated(kind: str, source: Callable[..., str], loop: LoopEquations) -> Any:
+    name = loop.belief.name
 
     def write() -> str:
-        program = build_loop_graph(
-            belief, plant, objective, switching, sampled=sampled, many_plants=many_plants
-        )
-        header = f"Closed loop of {belief.name}, {objective.name}; generated, do not edit."
-        return source(program, sampled=sampled, header=header)
+        header = f"Closed loop of {name}, {loop.objective.name}; generated, do not edit."
+        return source(build_loop_graph(loop), header=header)
 
-    return generated(kind, belief.name, key, write)
+    return generated(kind, name, loop.key, write)

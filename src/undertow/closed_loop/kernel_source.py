@@ -162,11 +162,11 @@ class _Writer:
             *self._store_law(),
         ]
 
-    def first_stage(self, *, sampled: bool) -> list[str]:
+    def first_stage(self) -> list[str]:
         """First Runge-Kutta stage, with everything that is watched."""
         r, program, text = self.rows, self.program, self.emit.text
         outputs = [*self.rates, *program.path]
-        if sampled:
+        if program.sampled:
             law, known = self._apply(r.u), set[sp.Symbol]()
         else:
             law = [*self._law(r.x, self.monitored), *self._store_law(), *self._apply()]
@@ -179,12 +179,15 @@ class _Writer:
             f"{r.cost_slope} = {text(program.stage)}",
         ]
 
-    def later_stage(self, *, sampled: bool) -> list[str]:
+    def later_stage(self) -> list[str]:
         """Runge-Kutta stages two to four; ``weight`` and ``reach`` tell them apart."""
         r = self.rows
-        held = [*self._apply(r.u), *self._flow(r.stage_x, self.rates, set())] if sampled else None
+        if self.program.sampled:
+            held = [*self._apply(r.u), *self._flow(r.stage_x, self.rates, set())]
+        else:
+            held = self._evaluate(r.stage_x)
         return [
-            *(held or self._evaluate(r.stage_x)),
+            *held,
             *self._slopes("{slope} = {slope} + weight * {d}", "reach"),
             f"{r.cost_slope} = {r.cost_slope} + weight * ({self.emit.text(self.program.stage)})",
         ]
@@ -411,7 +414,7 @@ class _Writer:
         ]
 
 
-def kernel_source(program: LoopGraph, *, sampled: bool, header: str) -> str:
+def kernel_source(program: LoopGraph, *, header: str) -> str:
     """Return the source of a module with one function ``rollout``.
 
     It and ``etd_integrate`` do the lanes from one number to another, whole groups of them: threads
@@ -421,15 +424,12 @@ def kernel_source(program: LoopGraph, *, sampled: bool, header: str) -> str:
     ----------
     program
         The closed loop.
-    sampled
-        False: the law acts in continuous time, inside every Runge-Kutta stage.  True: it
-        is evaluated every ``zoh_steps`` steps on the measured state and held in between.
     header
         Text for the module's docstring.
     """
     w = _Writer(program)
     sampling = ""
-    if sampled:
+    if program.sampled:
         sampling = f"""\
             if step % zoh_steps == 0:
                 sample = min(step // zoh_steps, noise.shape[0] - 1)
@@ -464,7 +464,7 @@ def rollout(
                 segment += 1
             broken = 0
 {sampling}\
-{_groups([*w.first_stage(sampled=sampled), *w.watch()], 3)}
+{_groups([*w.first_stage(), *w.watch()], 3)}
             if broken > 0:
                 fewer = True
 {_groups(w.break_off(), 4)}
@@ -477,7 +477,7 @@ def rollout(
                 weight = 1.0 if rk == 2 else 2.0
                 reach = half if rk == 0 else h
                 {w.time} = start + (step + (1.0 if rk == 2 else 0.5)) * h
-{_groups(w.later_stage(sampled=sampled), 4)}
+{_groups(w.later_stage(), 4)}
             {w.time} = start + step * h
             last = {w.time} + h
             if seek > 0.0:
@@ -496,7 +496,7 @@ def rollout(
                     break
         groups = min({GROUPS}, (to_lane - b) // {LANES})
 {_groups(w.collect(), 2)}
-{"" if sampled else _etd_integrate(w)}"""
+{"" if program.sampled else _etd_integrate(w)}"""
     return single_assignment(source)
 
 

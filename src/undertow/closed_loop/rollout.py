@@ -35,7 +35,7 @@ from undertow.closed_loop.adaptive_integrator import follow
 from undertow.closed_loop.buffers import NOTHING, RolloutBuffers
 from undertow.closed_loop.ensemble import TAIL, Ensemble, summarise
 from undertow.closed_loop.exponential_integrator import GIVEN_BACK
-from undertow.closed_loop.kernel import compile_look, compile_loop, slides
+from undertow.closed_loop.kernel import LoopEquations, compile_look, compile_loop
 from undertow.closed_loop.linear_model import Prepared, TerminalLinearModel, quadratic_stage
 from undertow.closed_loop.threads import shared
 from undertow.closed_loop.trajectory import Batch, Event, Trajectory, recorded
@@ -238,20 +238,20 @@ class ClosedLoop:
         return self.plant if self.ensemble is None else self.ensemble.plant
 
     @cached_property
+    def equations(self) -> LoopEquations:
+        """What its kernels are written from."""
+        return LoopEquations(
+            self.mechanism, self._given, self.objective, self.reaching.switching,
+            self.zoh_steps > 0, self.ensemble is not None,
+        )  # fmt: skip
+
+    @cached_property
     def _kernels(self) -> Any:
-        return compile_loop(
-            self.mechanism,
-            self._given,
-            self.objective,
-            self.reaching.switching,
-            self.zoh_steps > 0,
-            self.ensemble is not None,
-        )
+        return compile_loop(self.equations)
 
     @cached_property
     def _look(self) -> Any:
-        switching, sampled = self.reaching.switching, self.zoh_steps > 0
-        return compile_look(self.mechanism, self._given, self.objective, switching, sampled)
+        return compile_look(self.equations)
 
     @cached_property
     def numbers(self) -> LoopNumbers:
@@ -282,7 +282,7 @@ class ClosedLoop:
     @property
     def slides(self) -> bool:
         """Whether the law is discontinuous and acts in continuous time: it does not chatter."""
-        return slides(self.reaching.switching, sampled=self.zoh_steps > 0)
+        return self.equations.slides
 
     @cached_property
     def price_of_time(self) -> float:

@@ -25,7 +25,9 @@ class LoopGraph:
     The control part maps (x, surface, gains) to ``demand``, ``s`` and ``margins``; the flow
     part maps (t, x, ``applied``) to ``derivative``, ``stage`` and ``path``.  ``applied`` are
     the symbols that stand for the inputs after the actuator.  ``boxes`` are, where all of ``path``
-    are bounds of one state, its number and how far from the bound large steps stay.
+    are bounds of one state, its number and how far from the bound large steps stay.  The law of a
+    ``sampled`` loop is evaluated every ``zoh_steps`` steps on the measured state and held in
+    between; else it acts in continuous time, inside every Runge-Kutta stage.
 
     ``lane_inputs`` are what a lane brings with it: the law vector, and behind it the parameters of
     its plant where every lane has one of its own; ``plant_parameters`` are empty then.
@@ -47,6 +49,7 @@ class LoopGraph:
     path: tuple[sp.Expr, ...]
     input_margin: sp.Expr | None
     boxes: tuple[tuple[int, float], ...] = ()
+    sampled: bool = False
 
 
 class WorkArray:

@@ -10,15 +10,15 @@ from typing import Any, Self, cast
 import numpy as np
 
 from undertow.base.errors import InvalidInputError
-from undertow.base.verdict import Kind, Verdict
+from undertow.base.verdict import Verdict, inward, within
 from undertow.law import ProvedSet, ReachingLaw, Surface
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.claim import Claim
 from undertow.proofs.claims.model_data import law_of, model_of
-from undertow.proofs.claims.words import sentence
+from undertow.proofs.claims.words import limits_words, region_words, sentence, verdict_on
 from undertow.proofs.claims.written import claim_data
 from undertow.proofs.kernel import claims as kernel
-from undertow.proofs.kernel.model import Model
+from undertow.proofs.kernel.model import Model, Quantity
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,14 +49,12 @@ class LoopClaim(Claim):
         model = model_of(mechanism)
         own = self._own(model)
         answer = kernel.decide(model, law_of(mechanism, surface, law), own)
-        kind, varied = cast(Kind, answer.kind), [x for x in model.states if x in own.starts]
-        margin, unit = float("nan"), ""
-        if kind == "proved" and varied:
-            margin = float(min(abs(v) for v in own.starts[varied[0]]))
-            unit = mechanism.coordinates[model.states.index(varied[0]) % mechanism.n].unit
-        return Verdict(
-            sentence(own, model), kind, margin, unit, answer.witness, answer.why, answer.details
-        )
+        varied = [x for x in model.states if x in own.starts]
+        if answer.kind != "proved" or not varied:
+            return verdict_on(own, model, answer)
+        margin = float(min(abs(v) for v in own.starts[varied[0]]))
+        unit = mechanism.coordinates[model.states.index(varied[0]) % mechanism.n].unit
+        return verdict_on(own, model, answer, margin, unit)
 
     def stated(self, mechanism: Mechanism, verdict: Verdict) -> kernel.Claim:
         """Return the kernel's claim."""
@@ -118,3 +116,19 @@ class Starts:
         """Whether the state is one of them."""
         state = np.asarray(x, dtype=float)
         return bool(((self.box[:, 0] <= state) & (state <= self.box[:, 1])).all())
+
+
+@sentence.register
+def _(claim: kernel.ClosedLoop, model: Model) -> str:
+    rates = [Quantity(f"{p.name}_dot", f"{p.unit}/s") for p in model.positions]
+    starts = region_words([*model.positions, *rates], claim.starts).replace("for ", "with ", 1)
+    end = f"‖x‖ ≤ {inward(claim.ball, 6)}" if claim.ball else "the target"
+    held = f"held for {float(claim.period)!r} s" if claim.period else "renewed at every instant"
+    varied = ", ".join(f"{k} in {within(*ends)}" for k, ends in claim.plant.items())
+    plant = f"any with {varied}" if varied else "the model"
+    loads = ", ".join(inward(v, 6) for v in claim.disturbance)
+    return (
+        f"every motion from starts {starts}, exists for ever and converges to {end}, the law with "
+        f"its layer, its input clipped to {limits_words(model)} and {held}, the plant {plant}, "
+        f"{f'forces up to {loads}' if any(claim.disturbance) else 'no other force'}"
+    )

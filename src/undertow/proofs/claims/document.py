@@ -8,11 +8,11 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
 
 from undertow.base.errors import CertificateError
-from undertow.base.verdict import Kind, Verdict
+from undertow.base.verdict import Verdict
 from undertow.law import ReachingLaw, Surface
 from undertow.models.mechanism import Mechanism
 from undertow.proofs.claims.model_data import law_data, model_data
-from undertow.proofs.claims.words import sentence
+from undertow.proofs.claims.words import verdict_on
 from undertow.proofs.claims.written import claim_data
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.model import Law
@@ -105,6 +105,5 @@ def decide_document(
     """Decide all claims of a file: from the file alone."""
     decided = []
     for law, claim, answer in kernel.check(document, progress):
-        said, kind = sentence(claim, document.model), cast(Kind, answer.kind)
-        decided.append((law, claim, Verdict(said, kind, witness=answer.witness, method=answer.why)))
+        decided.append((law, claim, verdict_on(claim, document.model, answer)))
     return decided

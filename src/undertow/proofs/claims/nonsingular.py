@@ -8,18 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import cast
 
 from undertow.base.arguments import one_of, require
-from undertow.base.verdict import Kind, Verdict
+from undertow.base.verdict import Verdict, inward
 from undertow.law import ReachingLaw, Surface, check_surface_shape
 from undertow.models.mechanism import Mechanism
 from undertow.proofs.claims.claim import Box, Claim
 from undertow.proofs.claims.model_data import law_of, model_of
-from undertow.proofs.claims.words import sentence
+from undertow.proofs.claims.words import region_words, sentence, verdict_on
 from undertow.proofs.kernel import claims as kernel
+from undertow.proofs.kernel.model import Model
 
 #: The least ratio that is asked for.
 TINY = 1e-9
@@ -130,11 +130,9 @@ def nonsingular(
     if not margin and decide(TINY).kind == "proved":
         margin = largest(decide, 0.5, tolerance, 1.0).proved or TINY
     found, claim = decide(margin or TINY), kernel.Nonsingular(box, Fraction(margin or TINY))
-    proved = found.kind == "proved"
-    why = f"{found.why}, gave up" if found.kind == "undecided" else found.why
-    least = margin if proved else math.nan
-    said = sentence(claim, model)
-    return Verdict(said, cast(Kind, found.kind), least, "", found.witness, why)
+    if found.kind == "undecided":
+        found = replace(found, why=f"{found.why}, gave up")
+    return verdict_on(claim, model, found, margin if found.kind == "proved" else math.nan)
 
 
 def singular_distance(
@@ -196,3 +194,12 @@ class NonsingularClaim(Claim):
     def stated(self, mechanism: Mechanism, verdict: Verdict) -> kernel.Claim:
         """Return it with the ratio that was proved."""
         return kernel.Nonsingular(exact_region(mechanism, self.region), Fraction(verdict.margin))
+
+
+@sentence.register
+def _(claim: kernel.Nonsingular, model: Model) -> str:
+    where = region_words(model.positions, claim.region)
+    return (
+        f"the law exists {where}: M is positive definite, B and α_a − α_u M_uu⁻¹ M_auᵀ are "
+        f"non-singular, whose determinant keeps {inward(claim.ratio, 6)} of that at the target"
+    )

@@ -20,19 +20,18 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from undertow.base.errors import InvalidInputError
-from undertow.base.verdict import Kind, Verdict
+from undertow.base.verdict import Verdict, inward
 from undertow.law import ReachingLaw, Surface, check_surface_shape
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.claim import Box, Claim
 from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.claims.nonsingular import Largest, exact_region, largest, nonsingular
-from undertow.proofs.claims.words import sentence
+from undertow.proofs.claims.words import region_words, sentence, verdict_on
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.model import Law, Model
 
@@ -148,7 +147,8 @@ def reaching(
     exists = nonsingular(mechanism, surface, region, max_boxes=max_boxes)
     if not exists:
         why = f"the law is not shown to exist there: {exists.method}"
-        verdict = replace(exists, claim=condition.sentence(bounds, rate), method=why)
+        said = sentence(condition.stated(bounds, rate), condition.model)
+        verdict = replace(exists, claim=said, method=why)
         none = [condition.bound(j, 0.0, 0.0, {}) for j in range(mechanism.n)]
         return ReachingCertificate(verdict, tuple(none), 0.0)
     verdict = condition.verdict(bounds, rate)
@@ -220,15 +220,12 @@ class _Condition:
         law = self.law
         if more:
             law = replace(law, eta=tuple(k + Fraction(more) for k in law.eta))
-        return kernel.decide(self.model, law, self._stated(bounds, rate), self.max_boxes)
+        return kernel.decide(self.model, law, self.stated(bounds, rate), self.max_boxes)
 
-    def sentence(self, bounds: Sequence[float], rate: Sequence[float]) -> str:
-        """Return it in words."""
-        return sentence(self._stated(bounds, rate), self.model)
-
-    def _stated(
+    def stated(
         self, bounds: Sequence[float] | FloatArray, rate: Sequence[float]
     ) -> kernel.Reaching:
+        """Return it as the kernel decides it."""
         loads, rates = (tuple(map(Fraction, v)) for v in (bounds, rate))
         return kernel.Reaching(self.region, loads, rates)
 
@@ -260,9 +257,7 @@ class _Condition:
             margin = -1 / short.proved if short.proved else math.nan
             if short.proved and short.failed and short.failed.kind == found.kind:
                 found = replace(found, witness=short.failed.witness)
-        kind = cast(Kind, found.kind)
-        said = self.sentence(bounds, rate)
-        return Verdict(said, kind, margin, "1/s", found.witness, found.why)
+        return verdict_on(self.stated(bounds, rate), self.model, found, margin, "1/s")
 
     def alone(self, j: int, rate: Sequence[float]) -> DisturbanceBound:
         """What is overcome of a disturbance on coordinate j alone."""
@@ -312,3 +307,19 @@ class ReachingClaim(Claim):
         """Return it as the kernel decides it."""
         bounds, rate = (tuple(map(Fraction, v)) for v in (self.disturbance, self.eta))
         return kernel.Reaching(exact_region(mechanism, self.region), bounds, rate)
+
+
+@sentence.register
+def _(claim: kernel.Reaching, model: Model) -> str:
+    loads = ", ".join(
+        f"{p.name}: {inward(v, 6)} {'N m' if p.unit == 'rad' else 'N'}"
+        for p, v in zip(model.positions, claim.disturbance, strict=True)
+        if v
+    )
+    what = f"overcomes every disturbance on {loads} at most," if loads else "reaches the surface"
+    rates = ", ".join(inward(v, 6) for v in claim.rate)
+    return (
+        f"the law {what} {region_words(model.positions, claim.region)}: (16) with η = {rates}, "
+        "wherever |s_i| ≥ ε_i, the inputs not limited; motions that leave these positions are "
+        "not covered"
+    )

@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from undertow.base.arguments import require
-from undertow.base.verdict import Kind, Verdict
+from undertow.base.verdict import Kind, Verdict, inward, within
 from undertow.law import ReachingLaw, Surface
 from undertow.models.mechanism import Mechanism
 from undertow.proofs.claims.claim import Box, Claim
 from undertow.proofs.claims.model_data import law_of, model_of
-from undertow.proofs.claims.words import sentence
+from undertow.proofs.claims.words import sentence, verdict_on
 from undertow.proofs.claims.written import claim_data
 from undertow.proofs.kernel import claims as kernel
-from undertow.proofs.kernel.model import Matrix
+from undertow.proofs.kernel.model import Matrix, Model
 from undertow.proofs.kernel.region import Function, Stage, Stretch, on_the_line
 from undertow.proofs.region.lyapunov import LyapunovFunction
 from undertow.proofs.region.motion import SurfaceMotion
@@ -51,12 +51,9 @@ class RegionClaim(Claim):
         model = model_of(mechanism)
         own = kernel.read_claim(claim_data(self._own()), model)
         answer = kernel.decide(model, law_of(mechanism, surface, law), own)
-        kind, margin = cast(Kind, answer.kind), float(np.linalg.norm(self.start)) * (1 - 1e-12)
-        unit = mechanism.coordinates[mechanism.m].unit
-        return Verdict(
-            sentence(own, model), kind, margin if kind == "proved" else float("nan"), unit,
-            answer.witness, answer.why, answer.details,
-        )  # fmt: skip
+        reach = float(np.linalg.norm(self.start)) * (1 - 1e-12)
+        margin = reach if answer.kind == "proved" else float("nan")
+        return verdict_on(own, model, answer, margin, mechanism.coordinates[mechanism.m].unit)
 
     def stated(self, mechanism: Mechanism, verdict: Verdict) -> kernel.Claim:
         """Return the kernel's claim."""
@@ -180,3 +177,17 @@ def reaches(V: LyapunovFunction, point: Sequence[float]) -> bool:
     if function is None or not inside or len(point) != len(V.scale):
         return False
     return on_the_line(stretch, function, list(map(Fraction, point)), 10_000).kind == "proved"
+
+
+@sentence.register
+def _(claim: kernel.SurfaceRegion, model: Model) -> str:
+    names = kernel.surface_names(model)
+    away = {k: v for k, v in zip(names, claim.contains, strict=True) if v}
+    exact = len(away) > 1  # with one entry the point may be rounded towards 0
+    points = [f"{k} = {float(v)!r}" if exact else f"{k} = {inward(v, 6)}" for k, v in away.items()]
+    ranges = "".join(f", for every {k} in {within(*ends)}" for k, ends in claim.plant.items())
+    return (
+        "every motion on the surface from a compact set around the target that contains "
+        f"{', '.join(points) or 'it'} converges to the target{ranges}, non-singular all the "
+        f"way, in the union of {len(claim.functions)} such sets; the inputs not limited"
+    )

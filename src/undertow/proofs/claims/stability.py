@@ -12,16 +12,17 @@ from fractions import Fraction
 
 import numpy as np
 
-from undertow.base.verdict import Verdict
+from undertow.base.verdict import Verdict, inward
 from undertow.law import ReachingLaw, Surface, check_surface_shape
 from undertow.law.stability import sliding_matrix
 from undertow.models.mechanism import TIME, Mechanism
 from undertow.proofs.claims.claim import Claim
 from undertow.proofs.claims.model_data import law_of, model_of
+from undertow.proofs.claims.words import sentence
 from undertow.proofs.exact_model import exact_mechanism
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.graph import Span
-from undertow.proofs.kernel.model import System
+from undertow.proofs.kernel.model import Model, System
 
 
 def exact_linearisation(mechanism: Mechanism) -> list[list[Span]]:
@@ -113,3 +114,11 @@ class StabilityClaim(Claim):
     def stated(self, mechanism: Mechanism, verdict: Verdict) -> kernel.Claim:
         """Return it with the rate that was proved."""
         return kernel.Stability(Fraction(max(verdict.margin, 0.0)))
+
+
+@sentence.register
+def _(claim: kernel.Stability, model: Model) -> str:
+    return (
+        "motions on the surface near the target converge to it exponentially, at a rate of at "
+        f"least {inward(claim.rate, 6)} 1/s; how near is not said, and the input is not limited"
+    )

@@ -7,7 +7,7 @@ laws of one mechanism, whose numbers are inputs of one program, as a search and 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import lru_cache
 from typing import Any, Self, cast
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from undertow.base.arguments import require
-from undertow.base.verdict import Kind, Verdict, inward
+from undertow.base.verdict import Verdict, inward
 from undertow.law import (
     LawLayout,
     ProvedSet,
@@ -27,10 +27,11 @@ from undertow.law import (
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.claim import Claim
 from undertow.proofs.claims.model_data import law_of, model_of
+from undertow.proofs.claims.words import limits_words, sentence, verdict_on
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.compiled import between
 from undertow.proofs.kernel.graph import Graph, Intervals, Span
-from undertow.proofs.kernel.model import Law, System
+from undertow.proofs.kernel.model import Law, Model, System
 from undertow.proofs.require import require_autonomous
 
 
@@ -74,14 +75,6 @@ class TerminalEllipsoid(Claim):
         """Radius of the largest ball ‖x‖₂ ≤ r inside."""
         return float(self.radius / np.linalg.norm(self.W, 2))
 
-    def sentence(self, mechanism: Mechanism) -> str:
-        """Return in words what is claimed."""
-        return (
-            "every motion of the full closed loop, its input renewed at every instant, from "
-            f"{{|W x| ≤ ρ}}, which holds the ball ‖x‖ ≤ {inward(self.ball * (1 - 1e-12), 3)}, "
-            f"converges, inside the layer and {limits_in_words(mechanism)}"
-        )
-
     def decide(self, mechanism: Mechanism, surface: Surface, law: ReachingLaw) -> Verdict:
         """Decide whether it is a region of attraction of the full closed loop.
 
@@ -107,13 +100,11 @@ class TerminalEllipsoid(Claim):
         sound = math.isfinite(self.radius) and self.radius > 0
         require(sound, "radius of a terminal set", self.radius, "> 0")
         ClosedLoopProgram.of(mechanism, law.switching)
-        found = kernel.decide(
-            model_of(mechanism), law_of(mechanism, surface, law), self.stated(mechanism, None)
-        )
+        model, own = model_of(mechanism), self.stated(mechanism, None)
+        found = kernel.decide(model, law_of(mechanism, surface, law), own)
         margin = found.details.get("margin", math.nan)
         details = {"ball": self.ball, "box": found.details.get("box")}
-        claim = self.sentence(mechanism)
-        return Verdict(claim, cast(Kind, found.kind), margin, "", found.witness, found.why, details)
+        return verdict_on(own, model, replace(found, details=details), margin)
 
     def stated(self, mechanism: Mechanism, verdict: Verdict | None) -> kernel.TerminalEllipsoid:
         """Return it as the kernel decides it; U is a guess of the search, and not needed."""
@@ -123,12 +114,6 @@ class TerminalEllipsoid(Claim):
     def proved_set(self, mechanism: Mechanism, surface: Surface, law: ReachingLaw) -> ProvedSet:
         """Return it with the closed loop that it is of."""
         return ProvedSet(surface, law, self, mechanism.fingerprint)
-
-
-def limits_in_words(mechanism: Mechanism) -> str:
-    """Return the input limits, each as it is."""
-    parts = [f"|{i.name}| ≤ {float(i.limit)!r} {i.unit}".rstrip() for i in mechanism.inputs]
-    return ", ".join(parts)
 
 
 class ClosedLoopProgram:
@@ -235,3 +220,40 @@ def prove(
         loop.program, between(numbers, numbers), between(W, W), found.radius, between(C, C), layer,
         limits, centre,
     )  # fmt: skip
+
+
+@sentence.register
+def _(claim: kernel.TerminalEllipsoid, model: Model) -> str:
+    inside = inward(Fraction(ball(claim)), 3)
+    return (
+        "every motion of the full closed loop, its input renewed at every instant and the "
+        f"plant the model, from {{|W x| ≤ ρ}}, which holds the ball ‖x‖ ≤ {inside}, "
+        f"stays there and converges, inside the layer and {limits_words(model)}"
+    )
+
+
+def ball(claim: kernel.TerminalEllipsoid) -> float:
+    """A radius of a ball ‖x‖ ≤ r inside: ρ/c where c² − WᵀW is shown positive definite."""
+    size = float(np.linalg.norm(np.array(claim.W, dtype=float), 2))
+    for slack in (1e-12, 1e-6, 1.0):
+        c = Fraction(size * (1 + slack))
+        columns = list(zip(*claim.W, strict=True))
+        rest = [
+            [c * c * int(i == j) - sum(a * b for a, b in zip(p, q, strict=True))
+             for j, q in enumerate(columns)]
+            for i, p in enumerate(columns)
+        ]  # fmt: skip
+        if _positive(rest):
+            return float(claim.radius / c) * (1 - 1e-15)
+    return 0.0
+
+
+def _positive(A: list[list[Fraction]]) -> bool:
+    """Whether a symmetric rational matrix is positive definite, by its pivots."""
+    for j, row in enumerate(A):
+        if row[j] <= 0:
+            return False
+        for i in range(j + 1, len(A)):
+            factor = A[i][j] / row[j]
+            A[i] = [a - factor * b for a, b in zip(A[i], row, strict=True)]
+    return True

@@ -16,7 +16,6 @@ well conditioned however far the sets have come.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 
 import numpy as np
 
@@ -25,8 +24,6 @@ from undertow.proofs.region.lyapunov import LyapunovFunction, directions, extent
 from undertow.proofs.region.motion import SurfaceMotion
 from undertow.proofs.search.basis import CLEARANCE, POLE_PART, Basis, linear_part, slowest_rate
 from undertow.proofs.search.linear_program import minimise_linear
-
-Progress = Callable[[str], None]
 
 #: V where the ring begins; how far that edge may come in; t over the slowest rate.
 INNER, INWARD, DECAY = 0.9, 0.9, 0.03
@@ -61,9 +58,7 @@ def grow(
     way: FloatArray,
     degree: int,
     budget: SearchBudget,
-    goal: float,
     rng: np.random.Generator,
-    progress: Progress | None = None,
 ) -> list[LyapunovFunction]:
     """Return functions whose sets reach further and further along ``way``, each for the last.
 
@@ -79,16 +74,12 @@ def grow(
         Even degree of the functions.
     budget
         What may be spent.
-    goal
-        Reach that is enough.
     """
     chain: list[LyapunovFunction] = []
     growth, step = 0.06, 0.04
     ring = _Ring(motion, V, degree, rng)
     while growth > LEAST_GROWTH and budget.left:
         reach = extent(V, way)
-        if reach >= goal:
-            break
         row = ring.next(way, growth, step, reach, budget)
         found = None if row is None else ring.basis.function(row)
         if found is not None and extent(found, way) > reach * 1.0003:
@@ -96,10 +87,6 @@ def grow(
             chain.append(V)
             growth, step = min(1.25 * growth, 0.2), min(1.25 * step, 0.15)
             ring = _Ring(motion, V, degree, rng)
-            if progress is not None:
-                progress(
-                    f"degree {degree}: reach {extent(V, way):.4f}, {budget.programs} programs left"
-                )
         else:
             growth, step = growth / 1.5, step / 1.5
     return chain

@@ -9,7 +9,7 @@ last one is raised to the largest that is proved.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -22,7 +22,7 @@ from undertow.models.mechanism import FloatArray
 from undertow.proofs.claims.region import verify_region
 from undertow.proofs.region.lyapunov import LyapunovFunction, extent
 from undertow.proofs.region.motion import SurfaceMotion
-from undertow.proofs.search.chain import Progress, SearchBudget, grow
+from undertow.proofs.search.chain import SearchBudget, grow
 from undertow.proofs.search.chart import natural_stretch
 from undertow.proofs.search.quadratic import Start, quadratic
 
@@ -30,6 +30,9 @@ Chain = tuple[LyapunovFunction, ...]
 
 #: How close to the largest level that the checker proves; the first step on the way there.
 TIGHT, STRIDE = 1.02, 1.05
+
+#: Boxes of each function's proof.
+MOST_BOXES = 1_000_000
 
 #: Functions of a found chain that one proof tries to leap over, at first.
 LEAP = 16
@@ -89,8 +92,6 @@ def search_region(
     seed: int = 0,
     start: Start = "round",
     slow: bool = True,
-    goal: float = math.inf,
-    progress: Progress | None = None,
 ) -> Chain:
     """Find a chain whose last set {V ≤ 1} reaches far along a direction of y, by sampling.
 
@@ -113,10 +114,6 @@ def search_region(
     slow
         On a surface with one unactuated coordinate: whether the third of the coordinates of
         :mod:`undertow.proofs.search.chart` is η, not w.
-    goal
-        Stop when the set reaches so far along the direction.
-    progress
-        Called with a line of text after each step.
 
     Raises
     ------
@@ -131,7 +128,7 @@ def search_region(
     for k, degree in enumerate(degrees):
         share = (k + 1) / sum(range(1, len(degrees) + 1))
         budget = SearchBudget(math.floor(share * programs), share * seconds)
-        chain += grow(motion, chain[-1], way, degree, budget, goal, rng, progress)
+        chain += grow(motion, chain[-1], way, degree, budget, rng)
     return tuple(chain)
 
 
@@ -139,31 +136,18 @@ def prove_region(
     motion: SurfaceMotion,
     direction: ArrayLike,
     *,
-    degrees: Sequence[int] = (4, 6),
-    programs: int = 300,
     seconds: float = math.inf,
     seed: int = 0,
-    slow: bool = True,
-    goal: float = math.inf,
-    parameters: Mapping[str, tuple[float, float]] | None = None,
-    max_boxes: int = 1_000_000,
-    progress: Progress | None = None,
-    keep: Callable[[Chain], None] | None = None,
 ) -> ProvedRegion:
     """Search for a region of attraction, prove it, and raise its level as far as that goes.
 
     Parameters
     ----------
-    motion, direction, degrees, programs, seconds, seed, slow, goal, progress
+    motion, direction, seed
         As for :func:`search_region`.
-    parameters
-        Intervals of uncertain parameters, as for :func:`undertow.proofs.verify_region`.
-    max_boxes
-        Of each function's proof.  The proofs are not timed: with ``seconds`` left out the
-        work does not depend on the machine.
-    keep
-        Called with the functions that are proved so far, whenever there is one more: a run
-        that is stopped need not lose them.
+    seconds
+        Process time of the search at most.  The proofs are not timed: with ``seconds`` left out
+        the work does not depend on the machine.
 
     Returns
     -------
@@ -178,38 +162,21 @@ def prove_region(
         When the surface is not locally stable.
     """
     way = np.asarray(direction, dtype=float)
-    search = partial(search_region, motion, direction, seed=seed, slow=slow)
-    found = search(
-        degrees=degrees, programs=programs, seconds=seconds, goal=goal, progress=progress
-    )
+    search = partial(search_region, motion, direction, seed=seed)
+    found = search(seconds=seconds)
     # Sets that start round grow furthest, but near 0 the far one is proved with far less work.
     far, balanced = search(degrees=(), start="far")[0], search(degrees=(), start="balanced")[0]
 
     def decide(chain: Sequence[LyapunovFunction]) -> Verdict:
         """The last function, those before it being proved."""
-        verdict = verify_region(
-            motion,
-            chain,
-            parameters=parameters,
-            max_boxes=max_boxes,
-            proved=len(chain) - 1,
-        )
-        if progress is not None:
-            boxes = verdict.details.get("boxes")
-            progress(
-                f"function {len(chain)}: reach {extent(chain[-1], way):.4f} {verdict.kind}, "
-                f"{boxes} boxes"
-            )
-        if verdict and keep is not None:
-            keep(tuple(chain))
-        return verdict
+        return verify_region(motion, chain, max_boxes=MOST_BOXES, proved=len(chain) - 1)
 
     chain = _proved_chain((far, found[0], balanced), found, decide)
     if extent(chain[0], way) > extent(chain[-1], way):
         chain = chain[:1]
     level, raised = _tight_level(chain, decide)
     chain[-1] = level
-    verdict = verify_region(motion, chain, parameters=parameters, max_boxes=10**12)
+    verdict = verify_region(motion, chain, max_boxes=10**12)
     return ProvedRegion(motion, way, tuple(chain), verdict, extent(level, way) * (1 - 1e-9), raised)
 
 
