@@ -253,9 +253,9 @@ class Planning:
                     return _best_of(mended or answers[:1], answers)
             planner = planners.of(predictions.plausible(state.estimate), state.target, t)
             standing = judge.standing(here, loop, used, error, span)
-            # What suits all plants may be near a plan that is late on one of them.
-            plans = [standing] if standing is used else [standing, used]
-            near = [planner.propose(error, incumbent=plan, **ask) for plan in plans]
+            near = [planner.propose(error, incumbent=standing, **ask)]
+            if standing is not used:  # what suits all may be near what is late on one of them
+                near.append(planner.propose(error, incumbent=used, **ask))
             return _best_of(near, near)
         except Exception as error:  # the inner loop must survive whatever the outer loop does
             said = error_text(error)
