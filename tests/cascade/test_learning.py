@@ -413,6 +413,28 @@ def test_only_exact_states_leave_it_to_later_decisions(
     assert (after.plan == plan) == (not noise)
 
 
+def test_a_plan_that_is_late_on_a_plausible_plant_gives_way_to_one_close_by(
+    pendulum: ut.Mechanism,
+) -> None:
+    """It costs hardly more than that plan where nobody waits, and not what one in reserve does."""
+    objective, x = ut.MinimumEnergy(horizon=10.0), pendulum.state(phi=0.3)
+    made = ut.Cascade(pendulum, objective, belief=ut.Belief.relative(pendulum, **SPREAD))
+    exact = ut.ClosedLoop(pendulum, objective)
+    plan = ut.Optimiser(exact).propose(x, horizon=6.0).plan
+    assert plan is not None
+    left = 1.001 * float(exact.batch(x, plan).time[0])
+    assert not made.loop.batch(x, plan, duration=left).reached[0]
+    whole = made.loop.batch(x, plan)
+    assert whole.reached[0]
+    assert made.known is not None
+    memory = CascadeState(plan, x=tuple(x.tolist()), estimate=made.known.prior)
+    proposal = made.propose(memory, x, 0.0, left)
+    after, admission = made.apply_gate(memory, proposal, x, left)
+    assert admission.accepted
+    assert after.predicted == pytest.approx(whole.cost[0], rel=0.02)
+    assert proposal.incumbent_cost > 1.2 * whole.cost[0]  # of the plan in reserve
+
+
 def test_a_first_plan_looks_ahead_to_the_next_decision(pendulum: ut.Mechanism) -> None:
     """It suits all plants and stays if nothing is decided; the next decision begins with more."""
     made = replace(scheduled(pendulum), freedom=ut.DecisionVariables())

@@ -250,16 +250,29 @@ class Planning:
                         if found.plan and judge.mendable(here, loop, found.plan, error, span):
                             mended.append(found)
                 if mended or judge.mendable(here, loop, used, error, span):
-                    best = min(mended or answers[:1], key=lambda one: one.cost)
-                    return replace(
-                        best,
-                        incumbent_cost=answers[0].incumbent_cost,
-                        evaluations=sum(one.evaluations for one in answers),
-                        seconds=sum(one.seconds for one in answers),
-                    )
+                    return _best_of(mended or answers[:1], answers)
             planner = planners.of(predictions.plausible(state.estimate), state.target, t)
             standing = judge.standing(here, loop, used, error, span)
-            return planner.propose(error, incumbent=standing, **ask)
+            near = [planner.propose(error, incumbent=standing, **ask)]
+            if standing is not used:  # what suits all may be near what is late on one of them
+                near.append(planner.propose(error, incumbent=used, **ask))
+            return _best_of(near, near)
         except Exception as error:  # the inner loop must survive whatever the outer loop does
             said = error_text(error)
             return Proposal(None, "failed", math.inf, math.inf, (), 0, 0.0, sequence, t, said)
+
+
+def _best_of(answers: list[Proposal], asked: list[Proposal]) -> Proposal:
+    """The cheapest of some answers, with what was spent on all that were asked for.
+
+    The cost of the incumbent is that of the first one's.
+    """
+    best = min(answers, key=lambda one: one.cost)
+    if len(asked) == 1:
+        return best
+    return replace(
+        best,
+        incumbent_cost=asked[0].incumbent_cost,
+        evaluations=sum(one.evaluations for one in asked),
+        seconds=sum(one.seconds for one in asked),
+    )
