@@ -312,6 +312,12 @@ def test_members_with_errors_of_surface_and_state(loop: ut.ClosedLoop, rig: ut.M
     ]
     assert both == pytest.approx(max(costs), rel=1e-12)
     assert costs[0] != pytest.approx(costs[1], rel=1e-3)
+    part = 0.5 * float(np.linalg.norm(aside) / np.linalg.norm(x))
+    shorter = replace(loop, ensemble=replace(slips, state_error_part=part)).batch(x, vector)
+    half = alone.batch(x + 0.5 * aside, vector * (1 + off)).cost[0]
+    assert shorter.cost[0] == pytest.approx(max(costs[0], half), rel=1e-12)
+    with pytest.raises(InvalidInputError, match="state_error_part"):
+        replace(slips, state_error_part=0.0)
     with pytest.raises(InvalidInputError, match="surface_errors"):
         Ensemble(rig, values, surface_errors=np.zeros((2, 3)))
     with pytest.raises(InvalidInputError, match="state_errors"):

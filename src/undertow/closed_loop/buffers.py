@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -131,7 +132,12 @@ class RolloutBuffers:
             coupling = self.loop.numbers.coupling
             buffers.lanes[:, :, size - 1] = gamma_determinant(coupling, surfaces)
         if ensemble.state_errors.size:
-            buffers.states += ensemble.state_errors[buffers.member]
+            errors = ensemble.state_errors[buffers.member]
+            if ensemble.state_error_part < math.inf:
+                most = ensemble.state_error_part * np.linalg.norm(buffers.states, axis=1)
+                sizes = np.maximum(np.linalg.norm(errors, axis=1), np.finfo(float).tiny)
+                errors = np.minimum(1.0, most / sizes)[:, None] * errors
+            buffers.states += errors
         return buffers
 
     def batch(self, start: float) -> Batch:

@@ -7,6 +7,7 @@ inadmissible, and the cost is a risk measure over the members.  Searches and gat
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal, get_args
@@ -47,6 +48,8 @@ class Ensemble:
         by default.
     state_errors
         How far each member's initial state is off, (K, 2n); none by default.
+    state_error_part
+        Such an error is this part of the initial state's norm at most; infinite: it is as given.
 
     Raises
     ------
@@ -60,6 +63,7 @@ class Ensemble:
     weights: FloatArray = field(default_factory=lambda: np.empty(0))
     surface_errors: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
     state_errors: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    state_error_part: float = math.inf
 
     def __post_init__(self) -> None:
         """Check shapes and words."""
@@ -90,6 +94,9 @@ class Ensemble:
                 limit=f"{len(values)} numbers ≥ 0, not all of them 0",
             )
 
+        part = self.state_error_part
+        if not part > 0:
+            raise InvalidInputError("state_error_part of an ensemble", value=part, limit="> 0")
         n, m = self.plant.n, self.plant.m
         for name, size in (("surface_errors", 2 * m * n), ("state_errors", 2 * n)):
             errors = floats(f"{name} of an ensemble", getattr(self, name))

@@ -69,6 +69,9 @@ AXES = 7
 SLIPS = 16
 SLIP_OF_SURFACE = 1e-3
 SLIP_OF_STATE, SLIP_OF_TRAVEL = {"rad": 2e-3, "m": 2e-4}, 0.01
+#: A state is off by this part of its distance from the target at most.  Nearly home, a larger error
+#: would have to be made good anew at each decision in what little time is left, and is never there.
+SLIP_OF_DISTANCE = 0.01
 #: Half a percent of the change of velocity over 2 ms at full inputs, s, is noise; and the noise of
 #: what no input moves at the target, rad/s or m/s.
 SMALL, UNDRIVEN = 0.005 * 0.002, 0.004
@@ -390,7 +393,9 @@ class Belief:
         state_errors[1 : 1 + half, :n] = scale * signs[:, -n:]
         for errors in (surface_errors, state_errors):
             errors[1 + half : 1 + SLIPS] = -errors[1 : 1 + half]
-        return Ensemble(mechanism, values, self.risk, weights, surface_errors, state_errors)
+        return Ensemble(
+            mechanism, values, self.risk, weights, surface_errors, state_errors, SLIP_OF_DISTANCE
+        )
 
     def _effects(self, offset: FloatArray) -> FloatArray:
         """Return how accelerations near the target depend on the offsets, (E, p), relative."""
