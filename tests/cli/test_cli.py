@@ -23,7 +23,7 @@ from typer.main import get_command
 
 import undertow as ut
 from runs import run
-from undertow.base import ArtefactError, InvalidInputError, write_file
+from undertow.base import ArtefactError, InvalidInputError, table, write_file
 from undertow.cli import _ORDER, _place, app, main, terminal
 from undertow.cli.parsing import (
     aimed,
@@ -33,7 +33,7 @@ from undertow.cli.parsing import (
     parse_surface,
     parse_target,
 )
-from undertow.cli.terminal import progress_bar
+from undertow.cli.terminal import progress_bar, show
 from undertow.closed_loop import Event, Trajectory
 from undertow.closed_loop.trajectory import recorded
 from undertow.studies.motion import ended
@@ -597,6 +597,32 @@ def test_progress_says_how_much_time_is_left(
         for what, part in (("a", 0.2), ("b", 0.4), ("b", 0.41), ("c", 1.0)):
             tell(what, part)
     assert capsys.readouterr().err.splitlines() == ["… a", "… b, 30 s left", "… c"]
+
+
+def test_what_little_is_done_does_not_say_how_much_time_is_left(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Five seconds of compiling for the first hundredth are no pace."""
+    clock = iter((100.0, 105.0, 150.0))
+    monkeypatch.setattr("undertow.cli.terminal.time.monotonic", lambda: next(clock))
+    with progress_bar() as tell:
+        for what, part in (("a", 0.0), ("b", 0.01), ("c", 0.5)):
+            tell(what, part)
+    assert capsys.readouterr().err.splitlines() == ["… a", "… b", "… c, 50 s left"]
+
+
+def test_a_table_wider_than_the_terminal_is_not_cut(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Names stay whole; what may be broken into lines still is."""
+    monkeypatch.setenv("COLUMNS", "40")
+    heads = ["", *(f"entrant_{k}" for k in range(9))]
+    row = ["double pendulum on a cart", *map(str, range(9))]
+    show(table(heads, [row]), table(["", "what"], [["a name", "words " * 20]]))
+    wide, *rest = capsys.readouterr().out.splitlines()
+    assert wide.split() == heads[1:]
+    assert rest[0].split()[-9:] == row[1:]
+    assert max(len(line.rstrip()) for line in rest[1:]) <= 40
 
 
 # -- where the output goes -----------------------------------------------------------------------
