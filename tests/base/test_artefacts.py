@@ -162,5 +162,5 @@ def test_a_film_is_not_drawn_for_a_place_where_it_cannot_be(
 
 
 def test_a_zero_byte_in_the_name_of_a_folder_is_said(tmp_path: Path) -> None:
-    with pytest.raises(ArtefactError, match="null byte"):
+    with pytest.raises(ArtefactError, match="got a zero byte in its name"):
         check_folder(tmp_path / "re\0sults")

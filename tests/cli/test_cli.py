@@ -69,6 +69,14 @@ def test_help_ends_with_examples_that_parse_as_they_stand(path: tuple[str, ...])
         COMMANDS[path].make_context(path[-1], words[len(path) + 1 :])
 
 
+def test_a_group_of_commands_has_examples() -> None:
+    """Each is a call of a command in it."""
+    _, out, _ = run("export", "--help")
+    for line in out.split("Examples")[1].strip().splitlines():
+        _, *words = shlex.split(line)
+        COMMANDS[tuple(words[:2])].make_context(words[1], words[2:])
+
+
 def test_long_examples_are_folded_for_a_terminal_of_80_columns() -> None:
     """No line is longer."""
     for command in COMMANDS.values():
@@ -653,6 +661,17 @@ def test_a_full_disk_behind_a_redirection_is_one_line() -> None:
     assert ended.returncode == 1
     assert ended.stderr.startswith(b"error: the output: got No space left on device")
     assert ended.stderr.count(b"\n") == 1
+
+
+@pytest.mark.slow
+def test_who_reads_the_output_may_leave() -> None:
+    """`undertow … | head -1`: the exit status is the command's own, and nothing is said of it."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    ended = _typed("mechanisms", stdout=writer)
+    os.close(writer)
+    assert ended.returncode == 0
+    assert ended.stderr == b""
 
 
 @pytest.mark.slow

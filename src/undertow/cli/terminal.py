@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 import re
 import sys
 import textwrap
@@ -205,9 +206,17 @@ def _say_error(text: str) -> None:
     typer.echo(printable(" ".join(text.split())), err=True)
 
 
+class _Terminal(Console):
+    def on_broken_pipe(self) -> None:
+        """Say the rest to nobody: ``| head`` has gone, and the exit status is the command's own."""
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, self.file.fileno())
+        os.close(nowhere)
+
+
 def terminal(*, stderr: bool = False) -> Console:
     """Return the console to print on."""
-    return Console(stderr=stderr, highlight=False)
+    return _Terminal(stderr=stderr, highlight=False)
 
 
 @contextmanager
