@@ -69,6 +69,15 @@ def test_help_ends_with_examples_that_parse_as_they_stand(path: tuple[str, ...])
         COMMANDS[path].make_context(path[-1], words[len(path) + 1 :])
 
 
+@pytest.mark.parametrize("words", [("--seconds", "5"), ("--loop",)])
+def test_of_a_run_no_more_is_proved_than_is_said(words: tuple[str, ...]) -> None:
+    """Options that were passed over without a word are refused, before any work."""
+    code, _, err = run("certify", RIG, "--run", *words)
+    assert code == 2
+    assert f"error: {words[0]}: got" in err
+    assert "with --run, must be left out" in err
+
+
 def test_a_group_of_commands_has_examples() -> None:
     """Each is a call of a command in it."""
     _, out, _ = run("export", "--help")
