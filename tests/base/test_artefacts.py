@@ -51,6 +51,13 @@ def test_numbers_end_at_the_right_and_text_is_no_markup() -> None:
     ]
 
 
+def test_a_row_may_have_fewer_cells_than_heads() -> None:
+    assert shown(table(("name", "n", "whole"), [("a", "1")], whole=("whole",)))[1].split() == [
+        "a",
+        "1",
+    ]
+
+
 def test_a_ruled_table_has_its_title_above_and_its_note_below() -> None:
     lines = shown(
         table(("", "n"), [("a", "1")], title="Counts of all", note="n: how many", ruled=True)

@@ -152,7 +152,8 @@ def table(
     for index, head in enumerate(heads):
         first = index == 0
         unbroken = first or head in whole
-        cells = [head, *(str(line[index]) for line in lines if isinstance(line[index], Text))]
+        column = [cell for line in lines for cell in line[index : index + 1]]  # a row may be short
+        cells = [head, *(str(cell) for cell in column if isinstance(cell, Text))]
         widest = max(map(cell_len, "\n".join(cells).splitlines()), default=0)
         made.add_column(
             head,
