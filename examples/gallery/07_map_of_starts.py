@@ -2,7 +2,7 @@
 From where it comes home
 ========================
 
-A thousand starts in one call: caught, fallen, or singular. Sampled, so no proof; the map of
+1353 starts in one call: caught, fallen, or singular. Sampled, so no proof; the map of
 :doc:`/certificates` is proved.
 """
 

@@ -51,6 +51,13 @@ def test_numbers_end_at_the_right_and_text_is_no_markup() -> None:
     ]
 
 
+def test_a_row_may_have_fewer_cells_than_heads() -> None:
+    assert shown(table(("name", "n", "whole"), [("a", "1")], whole=("whole",)))[1].split() == [
+        "a",
+        "1",
+    ]
+
+
 def test_a_ruled_table_has_its_title_above_and_its_note_below() -> None:
     lines = shown(
         table(("", "n"), [("a", "1")], title="Counts of all", note="n: how many", ruled=True)
@@ -162,5 +169,5 @@ def test_a_film_is_not_drawn_for_a_place_where_it_cannot_be(
 
 
 def test_a_zero_byte_in_the_name_of_a_folder_is_said(tmp_path: Path) -> None:
-    with pytest.raises(ArtefactError, match="null byte"):
+    with pytest.raises(ArtefactError, match="got a zero byte in its name"):
         check_folder(tmp_path / "re\0sults")

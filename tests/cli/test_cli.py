@@ -23,7 +23,7 @@ from typer.main import get_command
 
 import undertow as ut
 from runs import run
-from undertow.base import ArtefactError, InvalidInputError, write_file
+from undertow.base import ArtefactError, InvalidInputError, table, write_file
 from undertow.cli import _ORDER, _place, app, main, terminal
 from undertow.cli.parsing import (
     aimed,
@@ -33,7 +33,7 @@ from undertow.cli.parsing import (
     parse_surface,
     parse_target,
 )
-from undertow.cli.terminal import progress_bar
+from undertow.cli.terminal import progress_bar, show
 from undertow.closed_loop import Event, Trajectory
 from undertow.closed_loop.trajectory import recorded
 from undertow.studies.motion import ended
@@ -67,6 +67,23 @@ def test_help_ends_with_examples_that_parse_as_they_stand(path: tuple[str, ...])
     for words in found:
         assert words[: len(path) + 1] == ["undertow", *path]
         COMMANDS[path].make_context(path[-1], words[len(path) + 1 :])
+
+
+@pytest.mark.parametrize("words", [("--seconds", "5"), ("--loop",)])
+def test_of_a_run_no_more_is_proved_than_is_said(words: tuple[str, ...]) -> None:
+    """Options that were passed over without a word are refused, before any work."""
+    code, _, err = run("certify", RIG, "--run", *words)
+    assert code == 2
+    assert f"error: {words[0]}: got" in err
+    assert "with --run, must be left out" in err
+
+
+def test_a_group_of_commands_has_examples() -> None:
+    """Each is a call of a command in it."""
+    _, out, _ = run("export", "--help")
+    for line in out.split("Examples")[1].strip().splitlines():
+        _, *words = shlex.split(line)
+        COMMANDS[tuple(words[:2])].make_context(words[1], words[2:])
 
 
 def test_long_examples_are_folded_for_a_terminal_of_80_columns() -> None:
@@ -599,6 +616,32 @@ def test_progress_says_how_much_time_is_left(
     assert capsys.readouterr().err.splitlines() == ["… a", "… b, 30 s left", "… c"]
 
 
+def test_what_little_is_done_does_not_say_how_much_time_is_left(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Five seconds of compiling for the first hundredth are no pace."""
+    clock = iter((100.0, 105.0, 150.0))
+    monkeypatch.setattr("undertow.cli.terminal.time.monotonic", lambda: next(clock))
+    with progress_bar() as tell:
+        for what, part in (("a", 0.0), ("b", 0.01), ("c", 0.5)):
+            tell(what, part)
+    assert capsys.readouterr().err.splitlines() == ["… a", "… b", "… c, 50 s left"]
+
+
+def test_a_table_wider_than_the_terminal_is_not_cut(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Names stay whole; what may be broken into lines still is."""
+    monkeypatch.setenv("COLUMNS", "40")
+    heads = ["", *(f"entrant_{k}" for k in range(9))]
+    row = ["double pendulum on a cart", *map(str, range(9))]
+    show(table(heads, [row]), table(["", "what"], [["a name", "words " * 20]]))
+    wide, *rest = capsys.readouterr().out.splitlines()
+    assert wide.split() == heads[1:]
+    assert rest[0].split()[-9:] == row[1:]
+    assert max(len(line.rstrip()) for line in rest[1:]) <= 40
+
+
 # -- where the output goes -----------------------------------------------------------------------
 
 
@@ -627,6 +670,17 @@ def test_a_full_disk_behind_a_redirection_is_one_line() -> None:
     assert ended.returncode == 1
     assert ended.stderr.startswith(b"error: the output: got No space left on device")
     assert ended.stderr.count(b"\n") == 1
+
+
+@pytest.mark.slow
+def test_who_reads_the_output_may_leave() -> None:
+    """`undertow … | head -1`: the exit status is the command's own, and nothing is said of it."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    ended = _typed("mechanisms", stdout=writer)
+    os.close(writer)
+    assert ended.returncode == 0
+    assert ended.stderr == b""
 
 
 @pytest.mark.slow

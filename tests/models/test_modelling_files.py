@@ -438,6 +438,12 @@ def test_broken_xml_is_refused(text: str, error: type[Exception], match: str) ->
         modelling.from_urdf(text)
 
 
+def test_what_mjcf_includes_is_no_model_by_itself() -> None:
+    """MuJoCo says the same; with other words it was a fault in the text."""
+    with pytest.raises(ModelError, match="root <mujocoinclude>, must be <mujoco>"):
+        modelling.from_mjcf("<mujocoinclude/>")
+
+
 @pytest.mark.parametrize(
     ("text", "match"),
     [

@@ -250,7 +250,7 @@ def test_an_earlier_log_is_kept(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.db", "run.db.1", "run.db.2"]
 
 
-@pytest.mark.parametrize("what", ["a log in use", "a folder", "a text"])
+@pytest.mark.parametrize("what", ["a log in use", "a folder", "a text", "a word", "a database"])
 def test_what_is_in_use_or_no_log_is_left_alone(tmp_path: Path, what: str) -> None:
     """Two runs must not write to one another's files, nor a log push other things aside."""
     path = tmp_path / "run.db"
@@ -259,6 +259,11 @@ def test_what_is_in_use_or_no_log_is_left_alone(tmp_path: Path, what: str) -> No
         path.mkdir()
     elif what == "a text":
         path.write_text("not a database, by any means" * 20)
+    elif what == "a word":  # SQLite takes so few bytes for an empty database
+        path.write_text("x")
+    elif what == "a database":
+        with contextlib.closing(sqlite3.connect(path)) as file:
+            file.execute("CREATE TABLE addresses (name TEXT)")
     with pytest.raises(ArtefactError, match=r"still writes|not a log"):
         Log(path, COLUMNS, {}, threaded=False)
     if first is not None:

@@ -132,6 +132,7 @@ def table(
         Further properties of :class:`rich.table.Table`.
     """
     from rich import box
+    from rich.cells import cell_len
     from rich.table import Table
     from rich.text import Text
 
@@ -147,15 +148,21 @@ def table(
     if note:
         shape |= {"caption": f"\n{note}\n", "caption_justify": "left"}
     made = Table(**shape | look)
+    lines = [[Text(cell) if isinstance(cell, str) else cell for cell in row] for row in rows]
     for index, head in enumerate(heads):
         first = index == 0
+        unbroken = first or head in whole
+        column = [cell for line in lines for cell in line[index : index + 1]]  # a row may be short
+        cells = [head, *(str(cell) for cell in column if isinstance(cell, Text))]
+        widest = max(map(cell_len, "\n".join(cells).splitlines()), default=0)
         made.add_column(
             head,
             justify="left" if first or head in left else "right",
-            no_wrap=first or head in whole,
+            no_wrap=unbroken,
+            min_width=widest if unbroken else None,
         )
-    for row in rows:
-        made.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
+    for line in lines:
+        made.add_row(*line)
     return made
 
 

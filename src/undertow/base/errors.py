@@ -120,6 +120,7 @@ def or_refused(what: str, limit: str, remedy: str) -> Iterator[None]:
         raise
     except (OSError, ValueError) as error:  # a ValueError: of a zero byte in a name
         said = getattr(error, "strerror", None) or str(error)
+        said = said.replace("embedded null byte", "a zero byte in its name")
         raise ArtefactError(what, value=said, limit=limit, remedy=remedy) from error
 
 

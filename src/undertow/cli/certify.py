@@ -86,7 +86,8 @@ def certify(
     appendix
         The paper's five cases instead.
     seconds
-        Time to search for each region on the surface, s; 0 skips the search.
+        Time to search for each region on the surface, s, by default 60, or 0 with --appendix; 0
+        leaves regions out. The proof of what is found comes on top.
     loop
         Also prove from how far off the target the closed loop converges: along a line up to the
         start where that names one state, else in a box of all that it names, each with both signs;
@@ -107,12 +108,15 @@ def certify(
 
     given = f"{name or 'no mechanism'}{' and --appendix' if appendix else ''}"
     alone, whole = "one of them: a run has its own surfaces", "whole ms, 0 to 100"
+    brief = "left out: of a run, stability and terminal sets are proved"
     timed, own = seconds is None or 0 <= seconds < 1e5, "an option of the loop's proof"
     effort = certification.LOOP_SECONDS if loop_seconds is None else loop_seconds
     region = not run and (bool(seconds) if seconds is not None or appendix else True)
     require(appendix == (name is None), "undertow certify", given, "a mechanism, or --appendix")
     require(not (run and surface is not None), "--surface with --run", surface, alone)
     require(timed, "--seconds", seconds, "in [0, 100000)")
+    require(not (run and seconds), "--seconds", f"{seconds} s, with --run", brief)
+    require(not (run and loop), "--loop", "with --run", brief)
     require(0 < effort < 1e5, "--loop-seconds", loop_seconds, "in (0, 100000)")
     require(loop or loop_seconds is None, "--loop-seconds", "without --loop", own)
     require(loop or not hold, "--hold", "without --loop", own)

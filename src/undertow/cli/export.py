@@ -20,6 +20,7 @@ from undertow.cli.terminal import (
     check_out,
     command,
     exit_unless,
+    folded,
     progress_bar,
     show,
     write,
@@ -36,8 +37,18 @@ from undertow.optimiser import Optimiser
 from undertow.plants.bench import bench_for
 from undertow.studies.rigs.export import upsets_table
 
-export = Application(help="Write the controller in C, a log for other programs.")
+export = Application()
 app.add_typer(export, name="export")
+
+
+@export.callback(
+    epilog=folded(
+        "undertow export c rotary_pendulum --out firmware",
+        "undertow export log run.db --mcap run.mcap",
+    )
+)
+def what() -> None:
+    """Write the controller in C, or the log of a run for other programs."""
 
 
 @command(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 import re
 import sys
 import textwrap
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn, ParamSpec, get_args,
 import typer
 from rich import progress as bars
 from rich.console import Console, RenderableType
+from rich.measure import Measurement
 from rich.text import Text
 from typer.core import TyperCommand, TyperGroup
 
@@ -40,6 +42,13 @@ P = ParamSpec("P")
 
 #: Longest line of an example, so that a terminal of 80 columns need not break it.
 WIDTH = 76
+
+#: Columns of the widest table.
+WIDEST = 1000
+
+#: Part of the work after which its pace tells how long the rest takes: what comes first is often
+#: small, and waits for compiled code.
+ENOUGH = 0.05
 
 
 class _Plain:
@@ -197,9 +206,17 @@ def _say_error(text: str) -> None:
     typer.echo(printable(" ".join(text.split())), err=True)
 
 
+class _Terminal(Console):
+    def on_broken_pipe(self) -> None:
+        """Say the rest to nobody: ``| head`` has gone, and the exit status is the command's own."""
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, self.file.fileno())
+        os.close(nowhere)
+
+
 def terminal(*, stderr: bool = False) -> Console:
     """Return the console to print on."""
-    return Console(stderr=stderr, highlight=False)
+    return _Terminal(stderr=stderr, highlight=False)
 
 
 @contextmanager
@@ -209,12 +226,13 @@ def progress_bar() -> Iterator[Progress]:
     begun: list[tuple[float, float]] = []
 
     def told(what: str, part: float) -> str:
-        """Add how long the rest takes, once that is known."""
+        """Add how long the rest takes, once enough is done to tell."""
         now = time.monotonic()
         begun[:] = begun or [(part, now)]
         done = part - begun[0][0]
-        left = f", {duration((now - begun[0][1]) * (1 - part) / done)} left" if done > 0 else ""
-        return what + (left if part < 1 else "")
+        if done < ENOUGH or part >= 1:
+            return what
+        return f"{what}, {duration((now - begun[0][1]) * (1 - part) / done)} left"
 
     if not console.is_terminal:
         said: list[str] = []
@@ -284,14 +302,19 @@ def carry_out(
 
 
 def show(*parts: RenderableType, stderr: bool = False, least: int = 0, **how: Any) -> None:
-    """Print tables, at least so many columns wide, and text without markup or folding."""
+    """Print tables, at least so many columns wide, and text without markup or folding.
+
+    A table that needs more columns than the terminal has gets them: no name is cut short.
+    """
     console = terminal(stderr=stderr)
-    console.width = max(console.width, least)
+    width = max(console.width, least)
     for part in parts:
         if isinstance(part, str):
             console.print(part, soft_wrap=True, markup=False)
-        else:
-            console.print(part, **how)
+            continue
+        room = console.options.update(max_width=WIDEST)
+        console.width = max(width, Measurement.get(console, room, part).minimum)
+        console.print(part, **how)
 
 
 def check_out(out: Path | None) -> None:

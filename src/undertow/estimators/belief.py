@@ -421,6 +421,11 @@ class Belief:
             Times, (N,), s; states, (N, 2n); inputs after the actuator, (N, m).  Between two rows
             the input runs straight from one to the other.
 
+        Returns
+        -------
+        ParameterEstimate
+            The one from before where a state or input is NaN or infinite: nothing is learnt then.
+
         Raises
         ------
         InvalidInputError

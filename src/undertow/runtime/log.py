@@ -71,6 +71,9 @@ LOOKED_AT = 0.3
 #: Free space without which no log is begun, bytes.
 MIN_FREE_SPACE = 1 << 24
 
+#: What is in the way of a log.
+NO_LOG = "something else of that name, not a log"
+
 #: What ends a journal of SQLite that belongs to another one.
 JOURNAL = bytes.fromhex("d9d505f920a163d7")
 
@@ -340,6 +343,8 @@ def check_log(path: Path) -> None:
             )
         for earlier in parts_of(path):
             _claim(earlier)
+            if not _is_log(earlier):
+                raise FileExistsError(NO_LOG)
 
 
 def part_path(path: Path, part: int) -> Path:
@@ -402,9 +407,8 @@ def _end(file: sqlite3.Connection) -> None:
 
 def _claim(path: Path) -> None:
     """See that an earlier log is nobody's any more: two runs would write to one's files."""
-    message = "something else of that name, not a log"
     if not path.is_file():
-        raise FileExistsError(message)
+        raise FileExistsError(NO_LOG)
     check_journal(path)
     with contextlib.closing(sqlite3.connect(path, timeout=0.0)) as file:
         try:
@@ -413,7 +417,15 @@ def _claim(path: Path) -> None:
             message = f"a log that a run still writes, or a program has open ({error})"
             raise FileExistsError(message) from error
         except sqlite3.DatabaseError as error:
-            raise FileExistsError(message) from error
+            raise FileExistsError(NO_LOG) from error
+
+
+def _is_log(path: Path) -> bool:
+    """Whether a file is a log, or the empty one that comes before it."""
+    if not path.stat().st_size:
+        return True
+    with contextlib.closing(sqlite3.connect(path)) as file:  # of a few letters: empty
+        return bool(file.execute("SELECT 1 FROM sqlite_master WHERE name = 'steps'").fetchone())
 
 
 def check_journal(path: Path) -> None:

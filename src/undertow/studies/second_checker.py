@@ -37,7 +37,7 @@ def second_checker() -> Path:
                 f"No compiler is found ({' or '.join(COMPILERS)}): install one, then make checker"
             )
         raise MissingExtraError(
-            f"second checker '{NAME}'", value="not built", limit="verify --both", remedy=remedy
+            f"second checker '{NAME}'", value="not built", limit="built", remedy=remedy
         )
     return Path(found)
 

@@ -292,7 +292,8 @@ def survey_table(entries: Sequence[Entry]) -> Table:
             )
         )
     made = table(heads, rows, whole=heads, padding=(0, 1, 0, 0))
-    made.columns[0].no_wrap, made.columns[0].ratio = False, 1
+    first = made.columns[0]
+    first.no_wrap, first.min_width, first.ratio = False, None, 1
     return made
 
 

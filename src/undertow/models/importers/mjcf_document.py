@@ -73,7 +73,7 @@ def mjcf_document(source: str | Path, frozen: Sequence[str] = ()) -> Document:
         For what is no model, a model in which nothing moves or too much does, and free bodies.
     """
     folder = None if is_text(source) else Path(source).parent
-    root = parse_xml(source, "mujoco", "mujocoinclude")
+    root = parse_xml(source, "mujoco")
     _Includes(folder, root).into(root, folder)
     count = sum(1 for _ in root.iter())
     if count > MOST:

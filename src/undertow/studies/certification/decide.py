@@ -128,13 +128,14 @@ def certify_surface(
         for claim, verdict in decide.disturbances():
             keep(claim, verdict)
         if seconds > 0:
-            tell("region on the surface", FIRST)
+            tell(f"region on the surface, a search of {seconds:g} s and a proof", FIRST)
             region, found, verdict = decide.region(seconds)
             keep(found, verdict)
             if region is not None and uncertain:
                 keep(*decide.region_in_box(region))
         if loop:
-            tell("the whole closed loop", FIRST + seconds)
+            searched = f"a search of {loop_seconds:g} s and a proof of about as long"
+            tell(f"the whole closed loop, {searched}", FIRST + seconds)
             keep(*decide.loop(hold, loop_seconds))
         if predict and start.any():
             tell("prediction", most - LAST)

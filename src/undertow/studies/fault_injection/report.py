@@ -24,7 +24,8 @@ HEADS = ("what fails, and how", "what happened", "verdict", "|u|/limit", "")
 def drill_table(outcomes: Sequence[CaseResult], live: Sequence[LiveResult] = ()) -> Table:
     """Return what happened in the drill, a row a fault, under what fails."""
     made = table(HEADS, left=HEADS[1:3], ruled=True)
-    made.columns[0].no_wrap, made.columns[0].ratio, made.columns[1].ratio = False, 4, 6
+    first, second = made.columns[:2]
+    first.no_wrap, first.min_width, first.ratio, second.ratio = False, None, 4, 6
     part = ""
     for outcome in outcomes:
         case, verdict = outcome.case, outcome.verdict
