@@ -12,7 +12,7 @@ from functools import singledispatch
 
 import numpy as np
 
-from undertow.base.verdict import inward, within
+from undertow.base.verdict import exactly, inward, within
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.claims import Region
 from undertow.proofs.kernel.model import Model, Quantity
@@ -36,7 +36,7 @@ def region(positions: Sequence[Quantity], box: Region) -> str:
 def limits(model: Model) -> str:
     """Return the input limits in words, each as it is."""
     parts = [
-        f"|{i.name}| ≤ {'inf' if i.value is None else repr(float(i.value))} {i.unit}".rstrip()
+        f"|{i.name}| ≤ {'inf' if i.value is None else exactly(i.value)} {i.unit}".rstrip()
         for i in model.inputs
     ]
     return ", ".join(parts)
@@ -55,7 +55,8 @@ def sentence(claim: kernel.Claim, model: Model) -> str:
 def _(claim: kernel.Stability, model: Model) -> str:
     return (
         "motions on the surface near the target converge to it exponentially, at a rate of at "
-        f"least {inward(claim.rate, 6)} 1/s; how near is not said, and the input is not limited"
+        f"least {inward(claim.rate, 6)} 1/s, the plant the model and no other force; how near is "
+        "not said, and the input is not limited"
     )
 
 
@@ -99,7 +100,7 @@ def _(claim: kernel.SurfaceRegion, model: Model) -> str:
     names = kernel.surface_names(model)
     away = {k: v for k, v in zip(names, claim.contains, strict=True) if v}
     exact = len(away) > 1  # with one entry the point may be rounded towards 0
-    points = [f"{k} = {float(v)!r}" if exact else f"{k} = {inward(v, 6)}" for k, v in away.items()]
+    points = [f"{k} = {exactly(v) if exact else inward(v, 6)}" for k, v in away.items()]
     ranges = "".join(f", for every {k} in {within(*ends)}" for k, ends in claim.plant.items())
     return (
         "every motion on the surface from a compact set around the target that contains "
@@ -113,7 +114,7 @@ def _(claim: kernel.ClosedLoop, model: Model) -> str:
     rates = [Quantity(f"{p.name}_dot", f"{p.unit}/s") for p in model.positions]
     starts = region([*model.positions, *rates], claim.starts).replace("for ", "with ", 1)
     end = f"‖x‖ ≤ {inward(claim.ball, 6)}" if claim.ball else "the target"
-    held = f"held for {float(claim.period)!r} s" if claim.period else "renewed at every instant"
+    held = f"held for {exactly(claim.period)} s" if claim.period else "renewed at every instant"
     varied = ", ".join(f"{k} in {within(*ends)}" for k, ends in claim.plant.items())
     plant = f"any with {varied}" if varied else "the model"
     loads = ", ".join(inward(v, 6) for v in claim.disturbance)
@@ -125,18 +126,22 @@ def _(claim: kernel.ClosedLoop, model: Model) -> str:
 
 
 def ball(claim: kernel.TerminalEllipsoid) -> float:
-    """A radius of a ball ‖x‖ ≤ r inside: ρ/c where c² − WᵀW is shown positive definite."""
-    size = float(np.linalg.norm(np.array(claim.W, dtype=float), 2))
-    for slack in (1e-12, 1e-6, 1.0):
+    """A radius of a ball ‖x‖ ≤ r inside: ρ/c where c² − WᵀW is shown positive definite.
+
+    W is taken of doubles, which are off by 2⁻⁵³ of themselves: so is ‖W‖, by 1e-15 at most.
+    """
+    W = np.array(claim.W, dtype=float)
+    size = float(np.linalg.norm(W, 2))
+    for slack in (1e-12, 1e-6, 1.0) if np.isfinite(2.0 * size) else ():
         c = Fraction(size * (1 + slack))
-        columns = list(zip(*claim.W, strict=True))
+        columns = [list(map(Fraction, column)) for column in W.T.tolist()]
         rest = [
             [c * c * int(i == j) - sum(a * b for a, b in zip(p, q, strict=True))
              for j, q in enumerate(columns)]
             for i, p in enumerate(columns)
         ]  # fmt: skip
         if _positive(rest):
-            return float(claim.radius / c) * (1 - 1e-15)
+            return float(claim.radius / c) * (1 - 1e-14)
     return 0.0
 
 
