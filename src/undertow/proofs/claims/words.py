@@ -80,8 +80,8 @@ def _(claim: kernel.Reaching, model: Model) -> str:
     rates = ", ".join(inward(v, 6) for v in claim.rate)
     return (
         f"the law {what} {region(model.positions, claim.region)}: (16) with η = {rates}, "
-        "wherever |s_i| ≥ ε_i, the inputs not limited; motions that leave these positions are "
-        "not covered"
+        "wherever |s_i| ≥ ε_i, the plant the model, the inputs renewed at every instant and not "
+        "limited; motions that leave these positions are not covered"
     )
 
 
@@ -89,8 +89,8 @@ def _(claim: kernel.Reaching, model: Model) -> str:
 def _(claim: kernel.TerminalEllipsoid, model: Model) -> str:
     inside = inward(Fraction(ball(claim)), 3)
     return (
-        "every motion of the full closed loop, its input renewed at every instant and the "
-        f"plant the model, from {{|W x| ≤ ρ}}, which holds the ball ‖x‖ ≤ {inside}, "
+        "every motion of the full closed loop, its input renewed at every instant, the plant the "
+        f"model and no other force, from {{|W x| ≤ ρ}}, which holds the ball ‖x‖ ≤ {inside}, "
         f"stays there and converges, inside the layer and {limits(model)}"
     )
 
@@ -105,7 +105,8 @@ def _(claim: kernel.SurfaceRegion, model: Model) -> str:
     return (
         "every motion on the surface from a compact set around the target that contains "
         f"{', '.join(points) or 'it'} converges to the target{ranges}, non-singular all the "
-        f"way, in the union of {len(claim.functions)} such sets; the inputs not limited"
+        f"way, in the union of {len(claim.functions)} such sets; the plant else the model, no "
+        "other force, the inputs not limited"
     )
 
 
