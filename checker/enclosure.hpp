@@ -7,7 +7,7 @@
 // operation hands on and no comparison accepts.
 //
 // Exact: two fractions, equal as long as the value is rational and short; else rounded outwards to
-// 512 bits.
+// 512 bits. Beyond 2^±20000 it is undefined, so that no file asks for numbers without end.
 #pragma once
 #include "exact.hpp"
 
@@ -230,6 +230,7 @@ private:
         if (low.size() > 4000 || (high.size() > 1100 && !(low == high))) {
             low = down(low);
             high = -down(-high);
+            if (std::max(low.size(), high.size()) > 21000) *this = undefined();
         }
     }
 };

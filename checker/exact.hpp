@@ -2,6 +2,7 @@
 // fractions. Nothing here is rounded but where a function says which way.
 #pragma once
 #include <algorithm>
+#include <chrono>
 #include <cmath>
 #include <cstdint>
 #include <cstdlib>
@@ -10,6 +11,14 @@
 #include <string>
 #include <utility>
 #include <vector>
+
+inline double now() {
+    return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
+}
+inline double deadline = HUGE_VAL;  // of the claim that is decided
+struct Late : std::runtime_error {  // long fractions took until then
+    Late() : std::runtime_error("the time is up") {}
+};
 
 // Sign and magnitude; the limbs hold 32 bits each, the lowest first, and the last one is not 0.
 struct Whole {
@@ -210,6 +219,7 @@ struct Fraction {
     Fraction(int64_t value = 0) : top(value) {}
     Fraction(Whole numerator, Whole denominator) : top(numerator), bottom(denominator) {
         if (bottom.sign() <= 0) throw std::logic_error("denominator");
+        if (bottom.limb.size() > 32 && now() > deadline) throw Late();
         Whole a = top, b = bottom;
         a.negative = false;
         while (!b.zero()) {

@@ -191,6 +191,18 @@ public:
     }
 };
 
+// No number but 0 is smaller than 1e-300 or larger than 1e300.
+inline const Fraction& usual_size(const Fraction& x) {
+    static const Fraction largest = [] {
+        Whole ten(1);
+        for (int i = 0; i < 300; ++i) ten = ten * 10;
+        return Fraction(ten, 1);
+    }();
+    const Fraction size = x.sign() < 0 ? -x : x;
+    if (x.sign() && (size > largest || size * largest < Fraction(1))) refuse("a number beyond 1e-300 to 1e300");
+    return x;
+}
+
 inline Fraction number_text(const std::string& s) {
     const auto bad = [&]() { refuse("a number text is not of the grammar"); };
     if (s.empty() || s.size() > 420) bad();
@@ -203,7 +215,7 @@ inline Fraction number_text(const std::string& s) {
         if (at == from || (s[from] == '0' && at - from > 1)) bad();
         return value;
     };
-    const auto signed_as = [&](const Fraction& x) { return negative ? -x : x; };
+    const auto signed_as = [&](const Fraction& x) { return usual_size(negative ? -x : x); };
     if (s.compare(at, 2, "0x") == 0) {
         at += 2;
         if (s.size() < at + 17 || (s[at] != '0' && s[at] != '1') || s[at + 1] != '.') bad();

@@ -340,7 +340,8 @@ def test_what_is_decided_is_in_the_sentence() -> None:
     assert "on theta: 0.001 N m at most" in load.claim
     assert "for |phi| ≤ 0.5 rad, the other coordinates at the target" in load.claim
     assert (
-        "the inputs not limited; motions that leave these positions are not covered" in load.claim
+        "the plant the model, the inputs renewed at every instant and not limited; motions that "
+        "leave these positions are not covered" in load.claim
     )
     weak = RIG.with_input_limit(12.345678901)
     search = search_for(weak, SURFACE, ut.ReachingLaw())

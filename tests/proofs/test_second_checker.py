@@ -23,6 +23,7 @@ from typer.testing import CliRunner
 import undertow as ut
 from support import rest_slow
 from undertow.cli import app
+from undertow.proofs.claims.certificate import Certificate
 from undertow.proofs.claims.document import document_bytes
 from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
 from undertow.proofs.kernel import claims as kernel
@@ -194,6 +195,12 @@ EDITS: dict[str, Callable[[Document], object]] = {
     "a name with a blank": lambda d: d["model"]["inputs"][0].update(name="a b"),
     "true": lambda d: d["made_with"].update(python=True),
     "a backslash": lambda d: d["made_with"].update(python="\\"),
+    "a node of true": lambda d: d["model"]["nodes"].append(["position", True]),
+    "a hint that is a list": lambda d: d["subjects"][0]["claims"][0].update(hint=[1]),
+    "a sentence in made_with": lambda d: d["made_with"].update({"all is proved": "1"}),
+    "a number too large": lambda d: d["subjects"][0]["claims"][1].update(radius=f"1{301 * '0'}"),
+    "a number too small": lambda d: d["subjects"][0]["law"].update(eta=[f"1/1{301 * '0'}"]),
+    "a tiny double": lambda d: d["subjects"][0]["claims"][0].update(rate="0x0.0000000000001p-1022"),
 }  # fmt: skip
 
 RAW: dict[str, Callable[[bytes], bytes]] = {
@@ -226,6 +233,98 @@ def test_files_that_are_none_are_refused_by_both(what: str, program: Path, tmp_p
     assert run.returncode == 1
     assert run.stderr.startswith("refused: ")
     assert not run.stdout
+
+
+@needs_compiler
+def test_points_of_several_entries_and_limits_are_said_exactly(
+    program: Path, tmp_path: Path
+) -> None:
+    """Entries that are rounded one by one may be a point that is not contained."""
+    kept = json.loads((ROOT / "tests/data/regions.json").read_text())
+    kept["model"]["inputs"][0]["limit"] = "43/3"
+    kept["subjects"] = kept["subjects"][3:4]
+    kept["subjects"][0]["claims"][0]["contains"] = ["2/7", "-1/3", "0"]
+    file = tmp_path / "regions.json"
+    file.write_bytes(signed(kept))
+    run = subprocess.run(
+        [program, file, "--seconds", "0.01"], capture_output=True, text=True, check=False
+    )
+    assert "(q_u, v_u, w) = [2/7, -1/3, 0]" in run.stdout
+    (subject,) = Certificate.from_bytes(file.read_bytes()).subjects
+    assert "contains phi = 2/7, phi_dot = -1/3 " in subject.claims[0].verdict.claim
+    kept = json.loads(KEPT.read_text())
+    kept["model"]["inputs"][0]["limit"] = "43/3"
+    said = Certificate.from_bytes(signed(kept)).subjects[0].claims[1].verdict.claim
+    assert "|voltage| ≤ 43/3 V" in said
+
+
+# -- files that ask for too much -------------------------------------------------------------------
+
+
+def long_numbers(document: Document, start: list[Any], less: str, factor: str) -> None:
+    """Add a node to f_u, made of repeated squares, that is 0 and whose terms are endless."""
+    nodes = document["model"]["nodes"]
+    nodes += [start, ["number", less], ["number", factor]]
+    at = len(nodes) - 3
+    nodes += [["sub", at, at + 1], ["mul", at + 3, at + 2]]
+    nodes += [["pow", at + 4 + k, 2] for k in range(60)]
+    last = len(nodes) - 1
+    nodes += [["sub", last, last], ["add", document["model"]["f"][1], last + 1]]
+    document["model"]["f"][1] = last + 2
+
+
+ENDLESS = {
+    "a large number": (["number", "7"], "0", str(10**250)),
+    "a long fraction": (["number", "1/7"], "0", f"{10**200 + 1}/{3 * 10**200 + 1}"),
+    "an interval": (["pi"], str(Fraction(math.pi)), str(10**50)),
+}  # fmt: skip
+
+
+@needs_compiler
+@pytest.mark.parametrize("what", ENDLESS)
+def test_numbers_without_end_are_undecided_at_once(
+    what: str, program: Path, tmp_path: Path
+) -> None:
+    """Stability and the ellipsoid ask for exact numbers at the target, the other claims do not."""
+    document = json.loads(KEPT.read_text())
+    long_numbers(document, *ENDLESS[what])
+    content = signed(document)
+    kinds = [c["kind"] for c in document["subjects"][0]["claims"]]
+    ours = [d.kind for _, _, d in check(read(content))]
+    theirs = verdicts(answer(program, content, tmp_path))
+    exact = ("stability", "terminal ellipsoid")
+    assert ours == ["undecided" if k in exact else "proved" for k in kinds]
+    assert theirs == ours
+
+
+@needs_compiler
+def test_long_fractions_end_with_the_time(program: Path, tmp_path: Path) -> None:
+    """W⁻¹ of 24 rows of fractions of 200 digits takes hours: undecided when the time is up."""
+    source, n = random.Random(1), 12
+    zeros, ones = [["0"] * (n - 1)], [["1"]]
+    document = json.loads(KEPT.read_text())
+    nodes = [["number", "1"], ["number", "0"]]
+    positions = [{"name": f"q{i}", "unit": "rad"} for i in range(n)]
+    mass = [[int(i != j) for j in range(i + 1)] for i in range(n)]
+    document["model"] |= {"positions": positions, "parameters": [], "nodes": nodes, "M": mass,
+                          "f": [1] * n, "B": [[0]]}  # fmt: skip
+    W = [
+        [f"{source.randrange(10**200)}/{source.randrange(1, 10**200)}" for _ in range(2 * n)]
+        for _ in range(2 * n)
+    ]
+    document["subjects"] = [{
+        "law": {"alpha_a": ones, "lambda_a": ones, "alpha_u": zeros, "lambda_u": zeros,
+                "eta": ["1"], "layer": ["1"], "switching": "saturation", "disturbance": ["0"] * n},
+        "claims": [{"kind": "terminal ellipsoid", "W": W, "radius": "1"}],
+    }]  # fmt: skip
+    file = tmp_path / "long.json"
+    file.write_bytes(signed(document))
+    run = subprocess.run(
+        [program, file, "--seconds", "0.2"], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert verdicts(run) == ["undecided"]
+    found = Certificate.from_bytes(file.read_bytes())  # its words, too, are made at once
+    assert "‖x‖ ≤ " in found.subjects[0].claims[0].verdict.claim
 
 
 # -- mutants, and a judge in floats that knows nothing of the checkers ---------------------------

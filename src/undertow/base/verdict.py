@@ -30,8 +30,21 @@ def within(low: float | Fraction, high: float | Fraction) -> str:
     """Return an interval as text, its ends rounded inwards, or exactly where it has no room."""
     ends = _rounded(low, 6, ROUND_CEILING), _rounded(high, 6, ROUND_FLOOR)
     if not low <= Fraction(ends[0]) <= Fraction(ends[1]) <= high:
-        ends = repr(float(low)), repr(float(high))
+        ends = exactly(low), exactly(high)
     return f"[{ends[0]}, {ends[1]}]"
+
+
+def exactly(value: float | Fraction) -> str:
+    """Return a number as the decimal or the double that it is, else as a fraction.
+
+    Examples
+    --------
+    >>> exactly(0.1), exactly(Fraction(1, 1000)), exactly(Fraction(1, 3))
+    ('0.1', '0.001', '1/3')
+    """
+    near = float(value) + 0.0
+    is_it = not math.isfinite(near) or Fraction(value) in (Fraction(near), Fraction(repr(near)))
+    return repr(near) if is_it else str(value)
 
 
 def _rounded(value: float | Fraction, digits: int, rounding: str) -> str:

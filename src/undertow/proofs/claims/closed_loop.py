@@ -10,7 +10,7 @@ from typing import Any, Self, cast
 import numpy as np
 
 from undertow.base.errors import InvalidInputError
-from undertow.base.verdict import Verdict, inward, within
+from undertow.base.verdict import Verdict, exactly, inward, within
 from undertow.law import ProvedSet, ReachingLaw, Surface
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.claim import Claim
@@ -123,7 +123,7 @@ def _(claim: kernel.ClosedLoop, model: Model) -> str:
     rates = [Quantity(f"{p.name}_dot", f"{p.unit}/s") for p in model.positions]
     starts = region_words([*model.positions, *rates], claim.starts).replace("for ", "with ", 1)
     end = f"‖x‖ ≤ {inward(claim.ball, 6)}" if claim.ball else "the target"
-    held = f"held for {float(claim.period)!r} s" if claim.period else "renewed at every instant"
+    held = f"held for {exactly(claim.period)} s" if claim.period else "renewed at every instant"
     varied = ", ".join(f"{k} in {within(*ends)}" for k, ends in claim.plant.items())
     plant = f"any with {varied}" if varied else "the model"
     loads = ", ".join(inward(v, 6) for v in claim.disturbance)

@@ -318,6 +318,6 @@ def _(claim: kernel.Reaching, model: Model) -> str:
     rates = ", ".join(inward(v, 6) for v in claim.rate)
     return (
         f"the law {what} {region_words(model.positions, claim.region)}: (16) with η = {rates}, "
-        "wherever |s_i| ≥ ε_i, the inputs not limited; motions that leave these positions are "
-        "not covered"
+        "wherever |s_i| ≥ ε_i, the plant the model, the inputs renewed at every instant and not "
+        "limited; motions that leave these positions are not covered"
     )

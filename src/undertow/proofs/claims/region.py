@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from undertow.base.arguments import require
-from undertow.base.verdict import Kind, Verdict, inward, within
+from undertow.base.verdict import Kind, Verdict, exactly, inward, within
 from undertow.law import ReachingLaw, Surface
 from undertow.models.mechanism import Mechanism
 from undertow.proofs.claims.claim import Box, Claim
@@ -184,10 +184,11 @@ def _(claim: kernel.SurfaceRegion, model: Model) -> str:
     names = kernel.surface_names(model)
     away = {k: v for k, v in zip(names, claim.contains, strict=True) if v}
     exact = len(away) > 1  # with one entry the point may be rounded towards 0
-    points = [f"{k} = {float(v)!r}" if exact else f"{k} = {inward(v, 6)}" for k, v in away.items()]
+    points = [f"{k} = {exactly(v) if exact else inward(v, 6)}" for k, v in away.items()]
     ranges = "".join(f", for every {k} in {within(*ends)}" for k, ends in claim.plant.items())
     return (
         "every motion on the surface from a compact set around the target that contains "
         f"{', '.join(points) or 'it'} converges to the target{ranges}, non-singular all the "
-        f"way, in the union of {len(claim.functions)} such sets; the inputs not limited"
+        f"way, in the union of {len(claim.functions)} such sets; the plant else the model, no "
+        "other force, the inputs not limited"
     )

@@ -120,5 +120,6 @@ class StabilityClaim(Claim):
 def _(claim: kernel.Stability, model: Model) -> str:
     return (
         "motions on the surface near the target converge to it exponentially, at a rate of at "
-        f"least {inward(claim.rate, 6)} 1/s; how near is not said, and the input is not limited"
+        f"least {inward(claim.rate, 6)} 1/s, the plant the model and no other force; how near is "
+        "not said, and the input is not limited"
     )

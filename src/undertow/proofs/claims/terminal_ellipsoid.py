@@ -226,25 +226,29 @@ def prove(
 def _(claim: kernel.TerminalEllipsoid, model: Model) -> str:
     inside = inward(Fraction(ball(claim)), 3)
     return (
-        "every motion of the full closed loop, its input renewed at every instant and the "
-        f"plant the model, from {{|W x| ≤ ρ}}, which holds the ball ‖x‖ ≤ {inside}, "
+        "every motion of the full closed loop, its input renewed at every instant, the plant the "
+        f"model and no other force, from {{|W x| ≤ ρ}}, which holds the ball ‖x‖ ≤ {inside}, "
         f"stays there and converges, inside the layer and {limits_words(model)}"
     )
 
 
 def ball(claim: kernel.TerminalEllipsoid) -> float:
-    """A radius of a ball ‖x‖ ≤ r inside: ρ/c where c² − WᵀW is shown positive definite."""
-    size = float(np.linalg.norm(np.array(claim.W, dtype=float), 2))
-    for slack in (1e-12, 1e-6, 1.0):
+    """A radius of a ball ‖x‖ ≤ r inside: ρ/c where c² − WᵀW is shown positive definite.
+
+    W is taken of doubles, which are off by 2⁻⁵³ of themselves: so is ‖W‖, by 1e-15 at most.
+    """
+    W = np.array(claim.W, dtype=float)
+    size = float(np.linalg.norm(W, 2))
+    for slack in (1e-12, 1e-6, 1.0) if np.isfinite(2.0 * size) else ():
         c = Fraction(size * (1 + slack))
-        columns = list(zip(*claim.W, strict=True))
+        columns = [list(map(Fraction, column)) for column in W.T.tolist()]
         rest = [
             [c * c * int(i == j) - sum(a * b for a, b in zip(p, q, strict=True))
              for j, q in enumerate(columns)]
             for i, p in enumerate(columns)
         ]  # fmt: skip
         if _positive(rest):
-            return float(claim.radius / c) * (1 - 1e-15)
+            return float(claim.radius / c) * (1 - 1e-14)
     return 0.0
 
 

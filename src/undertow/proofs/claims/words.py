@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from functools import singledispatch
 from typing import cast
 
-from undertow.base.verdict import Kind, Verdict, inward, within
+from undertow.base.verdict import Kind, Verdict, exactly, inward, within
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.claims import Region
 from undertow.proofs.kernel.model import Model, Quantity
@@ -36,7 +36,7 @@ def region_words(positions: Sequence[Quantity], box: Region) -> str:
 def limits_words(model: Model) -> str:
     """Return the input limits in words, each as it is."""
     parts = [
-        f"|{i.name}| ≤ {'inf' if i.value is None else repr(float(i.value))} {i.unit}".rstrip()
+        f"|{i.name}| ≤ {'inf' if i.value is None else exactly(i.value)} {i.unit}".rstrip()
         for i in model.inputs
     ]
     return ", ".join(parts)

@@ -142,19 +142,16 @@ def _sliding_matrix(model: Model, law: Law) -> Array | Decision:
     on = Sliding.of(graph, model, law, q, pull, v_u, own)
     rates, at = [*on.v_a, *v_u, *on.v_u_dot], [Span(0)] * size
     none = "det(M_uu − M_ua α_a⁻¹ α_u) = 0 at the target, or det α_a = 0: no sliding dynamics"
-    try:
-        if not all(v.low > 0 for v in graph.exact(on.pivots, at)):
-            return Decision("undecided", "M is not shown to be positive definite at the target")
-        for k in on.determinants:
-            (value,) = graph.exact([k], at)
-            if value.zero:
-                return Decision("refuted", none)
-            if not _sign(value):
-                return Decision("undecided", f"not excluded: {none}")
-        values, one = graph.exact(rates, at), graph.number(1)
-        slopes = [graph.exact(graph.tangents(rates, {k: one}), at) for k in graph.inputs]
-    except ArithmeticError as error:
-        return Decision("undecided", f"at the target: {error}")
+    if not all(v.low > 0 for v in graph.exact(on.pivots, at)):
+        return Decision("undecided", "M is not shown to be positive definite at the target")
+    for k in on.determinants:
+        (value,) = graph.exact([k], at)
+        if value.zero:
+            return Decision("refuted", none)
+        if not _sign(value):
+            return Decision("undecided", f"not excluded: {none}")
+    values, one = graph.exact(rates, at), graph.number(1)
+    slopes = [graph.exact(graph.tangents(rates, {k: one}), at) for k in graph.inputs]
     if not all(v.zero for v in values):
         return Decision("undecided", "f_u(0, 0) = 0 is not shown exactly")
     return np.array(slopes, dtype=object).T
@@ -186,11 +183,7 @@ def _sign(value: Span) -> int:
 
 def _regular(own: System) -> tuple[list[Node], list[Goal], Span] | str:
     """Nodes and goals of regularity, and det Γ(0); or why the target itself is not regular."""
-    try:
-        at = own.graph.exact([own.B_determinant, own.gamma_determinant], own.origin())
-    except ArithmeticError as error:
-        return f"at the target: {error}"
-    drive, gamma = at
+    drive, gamma = own.graph.exact([own.B_determinant, own.gamma_determinant], own.origin())
     if not _sign(drive) or not _sign(gamma):
         return "det B or det Γ may be 0 at the target"
     goals = [Goal(f"pivot {k + 1} of M is > 0") for k in range(own.model.n)]
@@ -508,10 +501,7 @@ class ClosedLoop(Claim):
             return Decision("undecided", why)
         if 2 * model.n + len(self.plant) > MOST_STATES:
             return Decision("undecided", f"more than {MOST_STATES} states and parameters that vary")
-        try:
-            loop = self._loop(model, law, self.terminal)
-        except ArithmeticError as error:
-            return Decision("undecided", f"at the target: {error}")
+        loop = self._loop(model, law, self.terminal)
         if isinstance(loop, str):
             return Decision("undecided", f"the terminal set: {loop}")
         box = {x: self.starts.get(x, (Fraction(0), Fraction(0))) for x in model.states}
@@ -563,12 +553,16 @@ def read_claim(data: Mapping[str, Any], model: Model) -> Claim:
     )
     known = KINDS[str(kind)]
     fields(data, f"claim '{known.kind}'", {"kind", *known.keys}, {"hint"})
+    require(isinstance(data.get("hint", {}), dict), "hint: an object")
     return known.read(data, model)
 
 
 def decide(model: Model, law: Law, claim: Claim, max_boxes: int = MOST_BOXES) -> Decision:
     """Decide a claim about a model and a law."""
-    return claim.decide(model, law, max_boxes)
+    try:
+        return claim.decide(model, law, max_boxes)
+    except ArithmeticError as error:
+        return Decision("undecided", f"at the target: {error}")
 
 
 def check(

@@ -39,7 +39,7 @@ _RATIONAL: Mapping[str, Callable[..., Span]] = {
 
 _ORDERED: Mapping[str, Callable[..., Fraction]] = {"max": max, "min": min, "abs": abs}
 
-#: Digits from which a rational number is enclosed in doubles instead.
+#: Binary digits of numerators and denominators: more are refused, before they eat all memory.
 _MOST_BITS = 40_000
 
 #: Functions with a rational value at a rational number: (where, value).
@@ -47,19 +47,26 @@ _KNOWN = {"sin": (0, 0), "cos": (0, 1), "exp": (0, 1), "log": (1, 0)}
 
 
 class Span:
-    """An interval with rational ends; a number where they are equal, and all of it is exact."""
+    """An interval with rational ends; a number where they are equal, and all of it is exact.
+
+    Raises
+    ------
+    ArithmeticError
+        For absurdly many digits.
+    """
 
     __slots__ = ("high", "low")
 
     def __init__(self, low: Fraction | int, high: Fraction | int | None = None) -> None:
         self.low = Fraction(low)
         self.high = self.low if high is None else Fraction(high)
-        if self.exact:
-            return
-        if max(self.low.denominator.bit_length(), self.high.denominator.bit_length()) > 1200:
+        if not self.exact and max(v.denominator.bit_length() for v in (self.low, self.high)) > 1200:
             grid = 2**600  # ends of many digits are rounded outward
             self.low = Fraction(math.floor(self.low * grid), grid)
             self.high = Fraction(math.ceil(self.high * grid), grid)
+        ends = self.low, self.high
+        if max(max(abs(v.numerator), v.denominator).bit_length() for v in ends) > _MOST_BITS:
+            raise ArithmeticError(f"a number of more than {_MOST_BITS} bits")
 
     @property
     def exact(self) -> bool:
@@ -347,9 +354,6 @@ class Graph:
                 found[k] = Span(Fraction(ops.PI.real), Fraction(ops.PI.imag))
             else:
                 found[k] = _applied(k.kind, *(found[j] for j in k.of))
-            low = found[k].low
-            if max(low.numerator.bit_length(), low.denominator.bit_length()) > _MOST_BITS:
-                raise ArithmeticError(f"a number of more than {_MOST_BITS} bits")
         return [found[k] for k in roots]
 
     def not_zero(self, roots: Collection[Node], at: Sequence[Span], what: str) -> str:
@@ -434,4 +438,4 @@ def _folded(kind: str, numbers: Sequence[Fraction]) -> Fraction | None:
         found = _applied(kind, *map(Span, numbers))
     except ArithmeticError:
         return None
-    return found.low if found.exact and found.low.denominator.bit_length() < _MOST_BITS else None
+    return found.low if found.exact else None

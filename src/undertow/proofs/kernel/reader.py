@@ -22,6 +22,8 @@ LARGEST, DEEPEST, MOST_NODES, MOST_POSITIONS, MOST_PARAMETERS, MOST_CLAIMS = (
 _HEX = re.compile(r"-?0x[01]\.[0-9a-f]{13}p[+-](?:0|[1-9][0-9]{0,3})", re.ASCII)
 _RATIO = re.compile(r"-?(?:0|[1-9][0-9]*)(?:/(?:0|[1-9][0-9]*))?", re.ASCII)
 
+_SCALE = 10**300  # of numbers: doubles around them are finite, and not 0
+
 _LEAVES = {"position", "velocity", "parameter"}
 _ONE = {"neg", "sqrt", "sin", "cos", "tanh", "exp", "log"}
 _TWO = {"add", "sub", "mul", "div"}
@@ -56,11 +58,15 @@ def number(text: Any) -> Fraction:
     if _HEX.fullmatch(text):
         exponent = int(text.partition("p")[2])
         require(-1022 <= exponent <= 1023, f"exponent {exponent} of a binary double")
-        return Fraction(float.fromhex(text))
-    require(_RATIO.fullmatch(text) is not None, f"number {text[:40]!r}")
-    above, _, below = text.partition("/")
-    require(not below or int(below) > 0, f"number {text[:40]!r}: a divisor of 0")
-    return Fraction(int(above), int(below or 1))
+        value = Fraction(float.fromhex(text))
+    else:
+        require(_RATIO.fullmatch(text) is not None, f"number {text[:40]!r}")
+        above, _, below = text.partition("/")
+        require(not below or int(below) > 0, f"number {text[:40]!r}: a divisor of 0")
+        value = Fraction(int(above), int(below or 1))
+    good = not value or 1 <= abs(value) * _SCALE <= _SCALE**2
+    require(good, f"number {text[:40]!r}: 0, or of a size from 10⁻³⁰⁰ to 10³⁰⁰")
+    return value
 
 
 def numbers(data: Any, count: int) -> tuple[Fraction, ...]:
@@ -236,9 +242,10 @@ def parse(content: bytes) -> dict[str, Any]:
         raise Refused(f"no UTF-8: {error.reason}") from error
     require("\\" not in text, "a backslash: no text needs one")
     level = 0
-    for piece in re.findall(r'"[^"]*"|[\[\]{}]', text):
+    for piece in re.findall(r'"[^"]*"|[\[\]{}]|true|false', text):
         level += {"[": 1, "{": 1, "]": -1, "}": -1}.get(piece, 0)
         require(level <= DEEPEST, f"nested deeper than {DEEPEST}")
+        require(piece not in ("true", "false"), f"{piece}, which no certificate has")
     try:
         data = json.loads(
             text, object_pairs_hook=_object, parse_int=_whole,
@@ -280,6 +287,6 @@ def read(content: bytes) -> Document:
     require(1 <= count <= MOST_CLAIMS, f"{count} claims: at least one, at most {MOST_CLAIMS}")
     require(isinstance(data["made_with"], dict), "made_with: an object")
     made_with = {
-        _short(k, 64): None if v is None else _short(v, 64) for k, v in data["made_with"].items()
+        _name(k): None if v is None else _short(v, 64) for k, v in data["made_with"].items()
     }
     return Document(model, data["model_hash"], tuple(subjects), made_with)

@@ -265,9 +265,9 @@ class Stage:
 
 def _negative_definite(H: Intervals) -> bool:
     """Whether every symmetric matrix in H (N, N) is: −Sᵀ H S ≻ 0, then S is invertible too."""
-    middle = 0.5 * (H.real + H.imag)
-    if not np.isfinite(middle).all():
+    if not np.isfinite(H).all():
         return False
+    middle = 0.5 * H.real + 0.5 * H.imag
     values, vectors = np.linalg.eigh(-0.5 * (middle + middle.T))
     if not values[0] > 0:
         return False
