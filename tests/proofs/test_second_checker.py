@@ -10,6 +10,7 @@ import random
 import re
 import shutil
 import subprocess
+from collections import Counter
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -21,6 +22,7 @@ import pytest
 from typer.testing import CliRunner
 
 import undertow as ut
+from false_claims import HAIRS, MAKERS, made
 from support import rest_slow
 from undertow.cli import app
 from undertow.proofs.claims.certificate import Certificate
@@ -503,6 +505,28 @@ def test_mutants_are_decided_alike_and_nothing_false_is_proved(
     print(f"{5 * documents} claims, {count}, 0 of what is refuted proved")
     assert count["proved"] > documents
     assert count["refuted by samples"] > documents
+
+
+@needs_compiler
+@pytest.mark.parametrize(("seed", "each"), rest_slow([(1, 4), (2, 60)], (1, 4)))
+def test_what_is_false_by_a_hair_is_not_proved(
+    program: Path, tmp_path: Path, seed: int, each: int
+) -> None:
+    """By crests too thin to be met by chance, holes, and numbers that end behind the 40th digit."""
+    source, tally = random.Random(seed), Counter[tuple[str, bool, str]]()
+    for name in MAKERS:
+        for index in range(each):
+            false = name == "hole" or index % 2 == 0
+            hair = HAIRS[0] if index == 1 else source.choice(HAIRS)
+            document = made(name, source, false, hair)
+            (ours,) = (d.kind for _, _, d in check(read(signed(document))))
+            (theirs,) = verdicts(answer(program, signed(document), tmp_path))
+            where = name, index, float(hair), ours, theirs, document
+            assert ("proved" if false else "refuted") not in (ours, theirs), where
+            tally += Counter([(name, false, ours), (name, false, theirs)])
+    print(dict(tally))
+    for name in MAKERS:  # what nothing proves tests nothing
+        assert tally[name, False, "proved"] >= (0 if name == "hole" else 1), (name, tally)
 
 
 @needs_compiler
