@@ -165,8 +165,10 @@ def start(toy: Toy, more: Fraction) -> Document:
         "coefficients": [str(size), str(2 * d), "2", "2"],
     }  # fmt: skip
     end = str(decimal((1 + exact(more)) / mp.sqrt(exact(size))))
-    claim = {"kind": "surface region", "stretch": [], "pole": None, "functions": [function],
-             "contains": [end, "0", "0"], "plant": {}}  # fmt: skip
+    claim: Document = {
+        "kind": "surface region", "stretch": [], "pole": None, "functions": [function],
+        "contains": [end, "0", "0"], "plant": {},
+    }  # fmt: skip
     return toy.document(claim, force=force)
 
 

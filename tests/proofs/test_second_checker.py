@@ -200,9 +200,8 @@ EDITS: dict[str, Callable[[Document], object]] = {
     "a node of true": lambda d: d["model"]["nodes"].append(["position", True]),
     "a hint that is a list": lambda d: d["subjects"][0]["claims"][0].update(hint=[1]),
     "a sentence in made_with": lambda d: d["made_with"].update({"all is proved": "1"}),
-    "a number too large": lambda d: d["subjects"][0]["claims"][1].update(radius=f"1{301 * '0'}"),
-    "a number too small": lambda d: d["subjects"][0]["law"].update(eta=[f"1/1{301 * '0'}"]),
-    "a tiny double": lambda d: d["subjects"][0]["claims"][0].update(rate="0x0.0000000000001p-1022"),
+    "a number too large": lambda d: d["subjects"][0]["claims"][1].update(radius=str(2**1024)),
+    "a number too small": lambda d: d["subjects"][0]["law"].update(eta=[f"1/{2**1074 + 1}"]),
 }  # fmt: skip
 
 RAW: dict[str, Callable[[bytes], bytes]] = {
@@ -258,6 +257,19 @@ def test_points_of_several_entries_and_limits_are_said_exactly(
     kept["model"]["inputs"][0]["limit"] = "43/3"
     said = Certificate.from_bytes(signed(kept)).subjects[0].claims[1].verdict.claim
     assert "|voltage| ≤ 43/3 V" in said
+
+
+@pytest.mark.parametrize("entry", ["1", f"1/{2**1074}", str(2**1023), "1/3"])
+def test_the_ball_that_is_said_lies_inside(entry: str) -> None:
+    """‖W x‖ ≤ ‖W‖ ‖x‖, whatever the size of W; none is said where that is not shown."""
+    rows = [[entry if i == j else "0" for j in range(4)] for i in range(4)]
+    document = json.loads(KEPT.read_text())
+    document["subjects"][0]["claims"][1]["W"] = rows
+    document["subjects"][0]["claims"][1]["radius"] = "1/10"
+    (subject,) = Certificate.from_bytes(signed(document)).subjects
+    said = re.findall(r"‖x‖ ≤ ([^ ,]+)", subject.claims[1].verdict.claim)
+    assert Fraction(said[0]) * Fraction(entry) <= Fraction(1, 10)
+    assert "/" in entry or float(said[0]) >= 0.099 / int(entry) or int(entry) > 2**1000
 
 
 # -- files that ask for too much -------------------------------------------------------------------
