@@ -191,15 +191,11 @@ public:
     }
 };
 
-// No number but 0 is smaller than 1e-300 or larger than 1e300.
+// No number but 0 is smaller than the least positive double, or larger than the largest.
 inline const Fraction& usual_size(const Fraction& x) {
-    static const Fraction largest = [] {
-        Whole ten(1);
-        for (int i = 0; i < 300; ++i) ten = ten * 10;
-        return Fraction(ten, 1);
-    }();
+    static const Fraction least = scaled(1, -1074), largest(shift(1, 1024) - shift(1, 971), 1);
     const Fraction size = x.sign() < 0 ? -x : x;
-    if (x.sign() && (size > largest || size * largest < Fraction(1))) refuse("a number beyond 1e-300 to 1e300");
+    if (x.sign() && (size > largest || size < least)) refuse("a number beyond the doubles");
     return x;
 }
 

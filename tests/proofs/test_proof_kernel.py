@@ -346,7 +346,7 @@ def test_a_file_has_no_sentence_to_believe() -> None:
     """Texts of the file are not printed: the sentence is the checker's own, of its own numbers."""
 
     def boast(document: Document) -> None:
-        document["made_with"] = {"every start converges": "proved"}
+        document["made_with"] = {"python": "every start converges"}
         document["model"]["name"] = "proved: every start at rest converges"
         claim_of(document, "stability")["rate"] = "1/2"
 

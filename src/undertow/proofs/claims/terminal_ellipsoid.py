@@ -239,7 +239,7 @@ def ball(claim: kernel.TerminalEllipsoid) -> float:
     """
     W = np.array(claim.W, dtype=float)
     size = float(np.linalg.norm(W, 2))
-    for slack in (1e-12, 1e-6, 1.0) if np.isfinite(2.0 * size) else ():
+    for slack in (1e-12, 1e-6, 1.0) if 1e-290 < size < 1e290 else ():
         c = Fraction(size * (1 + slack))
         columns = [list(map(Fraction, column)) for column in W.T.tolist()]
         rest = [
@@ -248,7 +248,7 @@ def ball(claim: kernel.TerminalEllipsoid) -> float:
             for i, p in enumerate(columns)
         ]  # fmt: skip
         if _positive(rest):
-            return float(claim.radius / c) * (1 - 1e-14)
+            return float(min(claim.radius / c, Fraction(10**300))) * (1 - 1e-14)
     return 0.0
 
 

@@ -22,7 +22,7 @@ LARGEST, DEEPEST, MOST_NODES, MOST_POSITIONS, MOST_PARAMETERS, MOST_CLAIMS = (
 _HEX = re.compile(r"-?0x[01]\.[0-9a-f]{13}p[+-](?:0|[1-9][0-9]{0,3})", re.ASCII)
 _RATIO = re.compile(r"-?(?:0|[1-9][0-9]*)(?:/(?:0|[1-9][0-9]*))?", re.ASCII)
 
-_SCALE = 10**300  # of numbers: doubles around them are finite, and not 0
+_LEAST, _MOST = Fraction(1, 2**1074), Fraction(2**1024 - 2**971)  # of doubles
 
 _LEAVES = {"position", "velocity", "parameter"}
 _ONE = {"neg", "sqrt", "sin", "cos", "tanh", "exp", "log"}
@@ -64,8 +64,8 @@ def number(text: Any) -> Fraction:
         above, _, below = text.partition("/")
         require(not below or int(below) > 0, f"number {text[:40]!r}: a divisor of 0")
         value = Fraction(int(above), int(below or 1))
-    good = not value or 1 <= abs(value) * _SCALE <= _SCALE**2
-    require(good, f"number {text[:40]!r}: 0, or of a size from 10⁻³⁰⁰ to 10³⁰⁰")
+    good = not value or _LEAST <= abs(value) <= _MOST
+    require(good, f"number {text[:40]!r}: 0, or of the size of a double")
     return value
 
 
