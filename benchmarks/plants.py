@@ -23,7 +23,7 @@ in do-mpc, robust horizon 1, over the ensemble of the belief's prior, ten times 
 alone.  *acados* is the real-time iteration of acados, energy alone, where ``--acados`` or
 ``UNDERTOW_ACADOS`` names a Python that has it.  Predictive control keeps 90 % of the travel that a
 mechanism declares, softly.  Nobody is charged for computing; *plan* is the median processor time of
-a planning.
+a planning.  Below a table stand the times of our searches after the first, by the clock.
 
 Reached is ‖x‖ ≤ 0.01 by the deadline, 10 s for energy and 6 s for time; cost counts until then.
 *Lost* counts plants that met the singularity, left 95 % of the travel or leant by a right angle;
@@ -134,7 +134,7 @@ Job = tuple[Task, int]
 class Outcome:
     """What a controller did to one plant, and the least that this plant allows.
 
-    ``plan`` is the median of the seconds of a planning, where it was timed.
+    ``plans`` are the seconds of its plannings, of ours those after the first plan.
     """
 
     task: Task
@@ -142,8 +142,13 @@ class Outcome:
     plant: int
     event: str
     cost: float
-    plan: float = math.nan
+    plans: tuple[float, ...] = ()
     bound: float = math.nan
+
+    @property
+    def plan(self) -> float:
+        """The median of its plannings, s; NaN without any."""
+        return float(np.median(self.plans)) if self.plans else math.nan
 
     @property
     def reached(self) -> bool:
@@ -214,19 +219,22 @@ def first_optimum(task: Task) -> ut.Surface:
     return memory.plan.surfaces[0]
 
 
-def ours(task: Task, controller: str, plant: ut.Mechanism) -> tuple[str, float]:
-    """Run one of the library's controllers; return how it ended, and its cost."""
+def ours(task: Task, controller: str, plant: ut.Mechanism) -> tuple[str, float, tuple[float, ...]]:
+    """Run one of the library's controllers; return how it ended, its cost, and its plannings, s."""
     motion: Any
+    plans: tuple[float, ...] = ()
     try:
         if controller == "kept":
             loop = ut.ClosedLoop(task.rig, task.aim, plant=plant, **task.steps)
             motion = loop.simulate(task.x0, first_optimum(task))
         else:
-            run = cascade(task.mechanism, task.objective, controller, task.hold)
-            motion = run.simulate(task.x0, plant=plant).trajectory
+            made = cascade(task.mechanism, task.objective, controller, task.hold)
+            run = made.simulate(task.x0, plant=plant)
+            motion = run.trajectory
+            plans = tuple(update.proposal.seconds for update in run.updates[1:])
     except UndertowError as error:
-        return type(error).__name__, math.inf
-    return motion.event.name, float(motion.cost)
+        return type(error).__name__, math.inf, ()
+    return motion.event.name, float(motion.cost), plans
 
 
 @cache
@@ -254,16 +262,16 @@ def predictive(name: str, objective: str, controller: str, start: tuple[float, .
     )
 
 
-def peers(task: Task, controller: str, plant: ut.Mechanism) -> tuple[str, float, float]:
-    """Run a peer; return how it ended, its cost, and the median of its plannings, s."""
+def peers(task: Task, controller: str, plant: ut.Mechanism) -> tuple[str, float, tuple[float, ...]]:
+    """Run a peer; return how it ended, its cost, and its plannings, s."""
     name, energy = task.mechanism, task.objective == "energy"
     room = box(name, TRAVEL, FALLEN)
     truth = Plant(plant, RADIUS, task.aim.horizon, room)
     if controller == "lqr":
         found = tuned(task.rig, task.start, RADIUS, task.aim.horizon, tuple(room.items()))
         if not found:
-            return "NONE", math.inf, math.nan
-        outcome, plan = truth.regulated(task.x0, found[task.objective].K), math.nan
+            return "NONE", math.inf, ()
+        outcome, plans = truth.regulated(task.x0, found[task.objective].K), ()
     else:
         start = task.start if controller == "scenario" else ()
         mpc = predictive(name, task.objective, controller, start)
@@ -273,8 +281,8 @@ def peers(task: Task, controller: str, plant: ut.Mechanism) -> tuple[str, float,
         control = mpc
         if controller != "scenario":
             control = Sampled(mpc, task.rig.input_limits, learning)
-        outcome, plan = truth.held(task.x0, control), float(np.median(mpc.seconds))
-    return outcome.event, outcome.energy if energy else outcome.time, plan
+        outcome, plans = truth.held(task.x0, control), tuple(mpc.seconds)
+    return outcome.event, outcome.energy if energy else outcome.time, plans
 
 
 def least(task: Task, plant: ut.Mechanism) -> float:
@@ -298,11 +306,8 @@ def outcomes(job: Job, controllers: tuple[str, ...], seed: int, bounds: bool) ->
     for name in controllers:
         if name in ("scenario", "acados") and task.objective == "time":
             continue
-        if name in OURS:
-            event, cost, plan = *ours(task, name, plant), math.nan
-        else:
-            event, cost, plan = peers(task, name, plant)
-        found.append(Outcome(task, name, number, event, cost, plan, lowest))
+        event, cost, plans = (ours if name in OURS else peers)(task, name, plant)
+        found.append(Outcome(task, name, number, event, cost, plans, lowest))
     return found
 
 
@@ -321,8 +326,8 @@ def row(some: list[Outcome], kept: dict[int, float]) -> list[str]:
     costs = np.array([one.cost for one in arrived])
     cells = [some[0].controller, f"{len(arrived)} of {len(some)}"]
     cells.append(str(sum(one.lost for one in some)))
-    plan = 1e3 * float(np.median([one.plan for one in some]))
-    last = "—" if math.isnan(plan) else f"{plan:.1f}"
+    plan = math.nan if some[0].controller in OURS else np.median([one.plan for one in some])
+    last = "—" if math.isnan(plan) else f"{1e3 * plan:.1f}"
     if not arrived:
         return [*cells, *["—"] * 6, last]
     cells += [f"{np.median(costs):.4g}", f"{costs.max():.4g}"]
@@ -346,6 +351,12 @@ def shown(task: Task, here: list[Outcome], seed: str) -> None:
     title += f"{state_words(task.rig, task.x0)}, {plants} plants, {seed}"
     title += f", our input held for {1e3 * task.hold:g} ms" if task.hold else ""
     table(title, header, [row(group, kept) for group in groups if group])
+    for group in groups:
+        seconds = 1e3 * np.array([t for one in group for t in one.plans])
+        if len(seconds) and group[0].controller in OURS:
+            median, most = np.quantile(seconds, [0.5, 0.95])
+            words = f"{median:.1f} ms in the median, {most:.1f} ms in 95 %, {seconds.max():.0f} ms"
+            print(f"{group[0].controller}: {words} at most, of {len(seconds):,} searches")
 
 
 def starts(name: str, factors: list[float] | None, angles: list[float]) -> list[FloatArray]:
@@ -375,6 +386,7 @@ def written(found: list[Any], path: Path) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         fields = [name for name in found[0].__dataclass_fields__ if name != "task"]
+        fields = ["plan" if name == "plans" else name for name in fields]
         writer.writerow(["mechanism", "objective", "start", *fields])
         for one in found:
             task = one.task
