@@ -22,7 +22,7 @@ from __future__ import annotations
 from harness import command_line, progress, table  # isort: skip  first: one thread
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 
@@ -91,10 +91,8 @@ def run(name: str, seed: int, number: int) -> SwingRun:
     t, truth, u = (np.array(column) for column in zip(*rows, strict=True))
     upright = truth - designs(name)[1].turns(truth[-1])
     outcome = judge(mechanism, Record(t, truth[:, : mechanism.n], truth, u, upright), number)
-    entered = [(t, text) for t, kind, text in report.events if kind == "state"]
-    caught = [t for t, text in entered if "SWING_UP → CATCH" in text]
-    thrown = sum("→ SWING_UP: " in text and "BRING_UP" not in text for _, text in entered)
-    stopped = rig.plant.stops_hit > 0
+    caught = [t for t, _, text in report.events if "SWING_UP → CATCH" in text]
+    thrown, stopped = max(0, report.entered["SWING_UP"] - 1), rig.plant.stops_hit > 0
     return SwingRun(outcome, caught[-1] if caught else np.nan, thrown, stopped)
 
 
@@ -124,10 +122,8 @@ def main() -> None:
     rows, lines = [], []
     for name in asked.only or SWINGING:
         numbers = progress(range(plants), name)
-        if asked.run:
-            runs = [run(name, asked.seed, number) for number in numbers]
-        else:
-            runs = [swung(name, asked.seed, number, asked.rig) for number in numbers]
+        swing = run if asked.run else partial(swung, rig=asked.rig)
+        runs = [swing(name, asked.seed, number) for number in numbers]
         rows.append(row(name, runs))
         fallen = [str(k) for k, run in enumerate(runs) if not run.outcome.balanced]
         part = 1.0 - len(fallen) / plants

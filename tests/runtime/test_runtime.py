@@ -352,6 +352,15 @@ def answered(request: Request, surface: ut.Surface) -> Answer:
 OTHER = ut.Surface(alpha_a=-1, lambda_a=-1.2, alpha_u=2.1, lambda_u=12.0)
 
 
+def test_what_a_planner_says_that_is_no_proposal_is_named(controller: Controller) -> None:
+    """The old plan stays, and the answer says what came instead."""
+    request, _, _ = asked(controller)
+    odd = replace(RECIPE.cascade, planner=SimpleNamespace(propose=lambda *_, **__: 7))
+    answer = respond(odd, request)
+    assert not answer.admission.accepted
+    assert answer.proposal.message == "not a proposal but a int"
+
+
 def test_an_answer_is_computed_for_the_predicted_state_and_used_at_its_time(
     controller: Controller,
 ) -> None:

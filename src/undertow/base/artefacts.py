@@ -109,6 +109,7 @@ def table(
     note: str = "",
     left: Collection[str] = (),
     whole: Collection[str] = (),
+    ratios: Mapping[str, int] | None = None,
     ruled: bool = False,
     **look: Any,
 ) -> Table:
@@ -126,6 +127,9 @@ def table(
         Heads of columns that begin at the left, besides the first; numbers end at the right.
     whole
         Heads of columns whose cells are never broken, besides the first.
+    ratios
+        Heads of columns that share what width there is, the first one perhaps, in which parts:
+        their cells may be broken.
     ruled
         Draw a line below the heads, which are bold then, and dim without it.
     **look
@@ -151,7 +155,8 @@ def table(
     lines = [[Text(cell) if isinstance(cell, str) else cell for cell in row] for row in rows]
     for index, head in enumerate(heads):
         first = index == 0
-        unbroken = first or head in whole
+        ratio = (ratios or {}).get(head)
+        unbroken = ratio is None and (first or head in whole)
         column = [cell for line in lines for cell in line[index : index + 1]]  # a row may be short
         cells = [head, *(str(cell) for cell in column if isinstance(cell, Text))]
         widest = max(map(cell_len, "\n".join(cells).splitlines()), default=0)
@@ -160,6 +165,7 @@ def table(
             justify="left" if first or head in left else "right",
             no_wrap=unbroken,
             min_width=widest if unbroken else None,
+            ratio=ratio,
         )
     for line in lines:
         made.add_row(*line)

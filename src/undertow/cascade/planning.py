@@ -267,11 +267,10 @@ def _best_of(answers: list[Proposal], asked: list[Proposal]) -> Proposal:
 
     The cost of the incumbent is that of the first one's.
     """
-    best = min(answers, key=lambda one: one.cost)
-    if len(asked) == 1:
-        return best
+    if len(asked) == 1:  # whatever a planner of one's own has said
+        return asked[0]
     return replace(
-        best,
+        min(answers, key=lambda one: one.cost),
         incumbent_cost=asked[0].incumbent_cost,
         evaluations=sum(one.evaluations for one in asked),
         seconds=sum(one.seconds for one in asked),

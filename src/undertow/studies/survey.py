@@ -291,10 +291,7 @@ def survey_table(entries: Sequence[Entry]) -> Table:
                 when.removesuffix(" s"),
             )
         )
-    made = table(heads, rows, whole=heads, padding=(0, 1, 0, 0))
-    first = made.columns[0]
-    first.no_wrap, first.min_width, first.ratio = False, None, 1
-    return made
+    return table(heads, rows, whole=heads, ratios={heads[0]: 1}, padding=(0, 1, 0, 0))
 
 
 def by_goal(entries: Sequence[Entry]) -> list[list[Entry]]:

@@ -23,9 +23,7 @@ HEADS = ("what fails, and how", "what happened", "verdict", "|u|/limit", "")
 
 def drill_table(outcomes: Sequence[CaseResult], live: Sequence[LiveResult] = ()) -> Table:
     """Return what happened in the drill, a row a fault, under what fails."""
-    made = table(HEADS, left=HEADS[1:3], ruled=True)
-    first, second = made.columns[:2]
-    first.no_wrap, first.min_width, first.ratio, second.ratio = False, None, 4, 6
+    made = table(HEADS, left=HEADS[1:3], ratios={HEADS[0]: 4, HEADS[1]: 6}, ruled=True)
     part = ""
     for outcome in outcomes:
         case, verdict = outcome.case, outcome.verdict
