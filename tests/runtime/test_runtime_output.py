@@ -358,12 +358,24 @@ def test_bring_up_ends_after_a_stated_time_with_what_is_missing(memory: CascadeS
     assert report.verdict.exit_code == EXIT_CODES["stopped"]
     assert (report.entered["CATCH"], device.writes) == (0, report.steps)
 
-    far = replace(RECIPE, start=(0.0, 3.0, 0.0, 0.0))
-    device = Device()
-    device.rig = far.make_rig()
+
+@pytest.mark.parametrize("phi", [3.0, 2 * math.pi + 0.1], ids=["hangs", "counted a turn"])
+def test_the_law_does_not_take_over_where_it_could_not_hold(
+    phi: float, memory: CascadeState
+) -> None:
+    """The pendulum hangs; or a hand holds it, and the counter began a turn off: no output."""
+    written: list[float] = []
+    far = replace(RECIPE, start=(0.0, phi, 0.0, 0.0))
+    device = Device(
+        read=lambda k, m: Measurement(m.t, np.array([0.0, phi + 1e-4 * (k % 2)])),
+        write=lambda _, u: written.append(float(np.abs(u).max())),
+    )
     report = driven(far.make_controller(memory), device, 5.0).report
-    assert report.stopped_by.startswith("bring-up: not where the law can take over, phi = ")
+    assert report.stopped_by.startswith(
+        f"bring-up: not where the law can take over, phi = {phi:.3g}"
+    )
     assert "within 2 s" in report.stopped_by
+    assert max(written) == 0.0
 
 
 # -- deadlines and clocks --------------------------------------------------------------------------

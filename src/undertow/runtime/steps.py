@@ -83,8 +83,8 @@ def act(
     if fault:
         since[0] = 0.0
     allowed = margin[0] > settings[0]
-    inside = used if swings else allowed
     lost = not allowed or not math.sqrt(whole) < settings[1] or away > settings[3]
+    inside = used if swings else not lost
     near = settings[2] * (2.0 if mode == {Mode.BALANCE:d} else 1.0)
     after, reason = transition(
         mode, command, fault, since[0] >= settings[4], inside, lost, math.sqrt(part) <= near, swings
