@@ -207,6 +207,62 @@ def test_missing_readings_are_bridged(arm: ut.Mechanism, kind: type) -> None:
             assert x[0] == pytest.approx(2.0 * (k + 1) * PERIOD, abs=2e-3)
 
 
+KINDS = KalmanFilter, FilteredDerivative, SuperTwisting
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_gap_is_as_long_as_the_clock_says(
+    kind: Callable[[ut.Mechanism], Estimator], arm: ut.Mechanism
+) -> None:
+    """A recording of a swing without 0.3 s of it, and one at 8 Hz by an estimator of 1 kHz."""
+    x0 = arm.state(phi=2.5)
+    whole = _swing(arm, x0)
+    for kept in (np.r_[0:1000, 1300:3000], np.arange(0, 3000, 125)):
+        estimator, off = kind(arm), []
+        estimator.reset(x0)
+        for k in kept:
+            x = estimator.estimate(Measurement(k * PERIOD, whole[k, :2]), np.zeros(1))
+            off.append(np.abs(x - whole[k]).max())
+        assert max(off) < 2.0  # rad/s: differentiators give the mean over the gap
+
+
+def _swing(arm: ut.Mechanism, x0: np.ndarray) -> np.ndarray:
+    """States of 3 s of free motion, (3000, 2n)."""
+    rig, rows = IdealRig(arm, x0, period=PERIOD), []
+    for _ in range(3000):
+        rows.append(rig.truth.copy())
+        rig.write(np.zeros(1))
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_readings_may_be_made_of_anything_but_not_of_another_number(
+    kind: Callable[[ut.Mechanism], Estimator], arm: ut.Mechanism
+) -> None:
+    """Lists, single precision; one too many once ended the process, an infinity the estimate."""
+    expected = None
+    for make in (np.array, list, np.float32):
+        estimator = kind(arm)
+        estimator.reset([0.0, 0.25, 0.0, 0.0])
+        for k in range(3):
+            x = estimator.estimate(Measurement(k * PERIOD, make([0.0, 0.25])), [0.5]).copy()
+        expected = x if expected is None else expected
+        np.testing.assert_array_equal(x, expected)
+    for k in range(3, 6):
+        estimator.estimate(Measurement(k * PERIOD, np.array([0.0, math.inf])), np.zeros(1))
+    assert np.isfinite(estimator.estimate(Measurement(6e-3, x[:2]), np.zeros(1))).all()
+    for q in ([0.0, 0.25, 0.0], [0.0], 0.25, [[0.0, 0.25]]):
+        with pytest.raises(
+            InvalidInputError, match=r"measured q: got shape .*must be shape \(2,\)"
+        ):
+            estimator.estimate(Measurement(7e-3, np.array(q)), np.zeros(1))
+
+
+def test_inputs_of_another_number_are_refused(arm: ut.Mechanism) -> None:
+    with pytest.raises(InvalidInputError, match="inputs written last"):
+        KalmanFilter(arm).estimate(Measurement(0.0, np.zeros(2)), np.zeros(0))
+
+
 def test_on_the_realistic_rig_the_model_is_worth_having(arm: ut.Mechanism) -> None:
     """Velocity errors in closed loop: Kalman filter < filtered derivative, super-twisting."""
     errors = {}

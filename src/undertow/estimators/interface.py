@@ -13,10 +13,15 @@ from numpy.typing import ArrayLike
 from undertow.base import InvalidInputError, one_for_each, positive
 from undertow.models import FloatArray, Mechanism
 from undertow.plants import Bench, Measurement
+from undertow.plants.interface import copy_numbers
 from undertow.symbolic import numba
 
 if TYPE_CHECKING:
     from undertow.estimators.belief import Belief, ParameterEstimate
+
+
+#: The longest time between two measurements that an estimator bridges, s.
+LONGEST_GAP = 1.0
 
 
 class Estimator(ABC):
@@ -62,6 +67,9 @@ class Estimator(ABC):
     def __init__(self, mechanism: Mechanism, period: float = 0.001) -> None:
         positive("period of an estimator", period)
         self.mechanism, self.period = mechanism, float(period)
+        self._q: FloatArray = np.zeros(mechanism.n)
+        self._u: FloatArray = np.zeros(mechanism.m)
+        self._t = math.nan
         self.disturbance: FloatArray = np.zeros(mechanism.m)
         self.felt: FloatArray = np.zeros(mechanism.m)
         self.parameters: FloatArray = mechanism.parameter_values.copy()
@@ -95,7 +103,9 @@ class Estimator(ABC):
         Parameters
         ----------
         measurement
-            The newest one.  Where a position is NaN the estimate goes on without it.
+            The newest one.  Where a position is no finite number the estimate goes on without it.
+            Of its time the difference from the last one counts; where that is negative, or more
+            than ``LONGEST_GAP``, a period: :meth:`reset` is for another motion.
         u
             The inputs written last, (m,).
 
@@ -103,7 +113,23 @@ class Estimator(ABC):
         -------
         numpy.ndarray
             The estimator's own array: the next call writes it over.
+
+        Raises
+        ------
+        InvalidInputError
+            For another number of positions than the mechanism's, or of inputs where they are used.
         """
+
+    def _elapsed(self, t: float) -> float:
+        """Return the time since the last measurement, s; one period where that makes no sense."""
+        h = t - self._t
+        self._t = t
+        return h if 0.0 < h <= max(LONGEST_GAP, self.period) else self.period
+
+    def _positions(self, measurement: Measurement) -> FloatArray:
+        """Return the measured positions, (n,), as compiled code takes them."""
+        copy_numbers(measurement.q, self._q, "measured q")
+        return self._q
 
 
 #: What makes the estimator of a belief for a bench.
@@ -121,7 +147,7 @@ class Measured(Estimator):
 
     def __init__(self, mechanism: Mechanism, period: float = 0.001) -> None:
         super().__init__(mechanism, period)
-        self._x = np.zeros(2 * mechanism.n)
+        self._x, self._v = np.zeros(2 * mechanism.n), np.zeros(mechanism.n)
 
     def reset(self, x0: ArrayLike) -> None:
         """Start again from the state x0, (2n,)."""
@@ -136,9 +162,10 @@ class Measured(Estimator):
                 limit="positions and velocities",
                 remedy="Use undertow.estimators.KalmanFilter",
             )
-        n = len(measurement.q)
+        q, n = self._positions(measurement), self.mechanism.n
+        copy_numbers(measurement.v, self._v, "measured v")
         for i in range(n):
-            for place, value in ((i, measurement.q[i]), (n + i, measurement.v[i])):
+            for place, value in ((i, q[i]), (n + i, self._v[i])):
                 if not np.isnan(value):
                     self._x[place] = value
         return self._x
@@ -149,7 +176,7 @@ def _filtered(x: FloatArray, last: FloatArray, q: FloatArray, h: float, rest: Fl
     """Tustin's form of s/(τ s + 1), coordinate by coordinate."""
     n = q.shape[0]
     for i in range(n):
-        if q[i] == q[i]:
+        if abs(q[i]) < math.inf:
             x[i] = q[i]
             tau = rest[i]
             v = x[n + i]
@@ -166,7 +193,7 @@ def _twisted(x: FloatArray, q: FloatArray, h: float, bound: FloatArray) -> None:
     n = q.shape[0]
     for i in range(n):
         ahead = x[i] + h * x[n + i]
-        if q[i] != q[i]:
+        if not abs(q[i]) < math.inf:
             x[i] = ahead
             continue
         error = ahead - q[i]
@@ -183,23 +210,16 @@ def _twisted(x: FloatArray, q: FloatArray, h: float, bound: FloatArray) -> None:
 
 
 class _Differentiator(Estimator):
-    """What both share: a state, a clock, a first measurement."""
+    """What both share: a state, and the time of the last measurement."""
 
     def __init__(self, mechanism: Mechanism, period: float) -> None:
         super().__init__(mechanism, period)
         self._x = np.zeros(2 * mechanism.n)
-        self._t = math.nan
 
     def reset(self, x0: ArrayLike) -> None:
         """Start again from the state x0, (2n,)."""
         self._x[:] = x0
         self._t = math.nan
-
-    def _elapsed(self, t: float) -> float:
-        """Return the time since the last measurement, s; one period where there is none."""
-        h = t - self._t
-        self._t = t
-        return h if 0.0 < h < 100.0 * self.period else self.period
 
 
 class FilteredDerivative(_Differentiator):
@@ -230,7 +250,7 @@ class FilteredDerivative(_Differentiator):
     def estimate(self, measurement: Measurement, u: FloatArray) -> FloatArray:
         """Return (q measured, q̇ filtered); the inputs are not used."""
         h = self._elapsed(measurement.t)
-        _filtered(self._x, self._last, measurement.q, h, self._rest)
+        _filtered(self._x, self._last, self._positions(measurement), h, self._rest)
         return self._x
 
 
@@ -261,5 +281,5 @@ class SuperTwisting(_Differentiator):
 
     def estimate(self, measurement: Measurement, u: FloatArray) -> FloatArray:
         """Return the differentiator's (z₀, z₁); the inputs are not used."""
-        _twisted(self._x, measurement.q, self._elapsed(measurement.t), self._bound)
+        _twisted(self._x, self._positions(measurement), self._elapsed(measurement.t), self._bound)
         return self._x

@@ -35,6 +35,7 @@ from undertow.estimators.belief import EVEN, Belief, ParameterEstimate
 from undertow.estimators.interface import Estimator
 from undertow.models import FloatArray, Mechanism, fastest_rate, require_smooth
 from undertow.plants import Measurement
+from undertow.plants.interface import copy_numbers
 from undertow.plants.stepping import compiled_module
 from undertow.symbolic import BRIEF, COMPILED, Workspace, numba, unpacked
 
@@ -145,8 +146,9 @@ def readings_after_jump(
     if odd[1] == 2.0:
         odd[2] += 1.0
     for i in range(n):
-        taken[i] = q[i]
-        if q[i] == q[i]:
+        taken[i] = math.nan
+        if abs(q[i]) < math.inf:
+            taken[i] = q[i]
             way = (q[i] - x[i]) ** 2
             P[i, i] += way
             P[i, n + i] += way / odd[0]
@@ -444,11 +446,9 @@ class KalmanFilter(Estimator):
 
     def estimate(self, measurement: Measurement, u: FloatArray) -> FloatArray:
         """Return the state after a measurement, (2n,); see :class:`Estimator`."""
-        h = measurement.t - self._t
-        self._t = measurement.t
-        if not 0.0 < h < 100.0 * self.period:
-            h = self.period
-        self._estimate(h, measurement.q, u, self._block, self._size, self._lead, self._known)
+        q, h = self._positions(measurement), self._elapsed(measurement.t)
+        copy_numbers(u, self._u, "inputs written last")
+        self._estimate(h, q, self._u, self._block, self._size, self._lead, self._known)
         return self._state
 
     @property

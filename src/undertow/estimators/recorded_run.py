@@ -65,7 +65,7 @@ def run_recorded(
     """
     count = round(seconds / rig.period)
     between("samples of a run on a rig", count, 1, 10_000_000)
-    last: FloatArray = np.zeros(0)
+    last: FloatArray = np.zeros(estimator.mechanism.m)
     nothing = np.full(1, np.nan)
     rows: list[tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]] = []
 

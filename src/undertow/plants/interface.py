@@ -11,6 +11,7 @@ from numbers import Real
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from undertow.base import ArtefactError, InvalidInputError, UndertowError, error_text, raised_at
 from undertow.models import FloatArray, Mechanism
@@ -38,6 +39,39 @@ class Measurement:
     t: float
     q: FloatArray
     v: FloatArray | None = None
+
+
+def copy_numbers(values: ArrayLike, place: FloatArray, what: str) -> None:
+    """Copy what a rig or its user said into its place, (k,), whatever it is made of.
+
+    Raises
+    ------
+    InvalidInputError
+        When it is not k numbers.
+    """
+    if getattr(values, "shape", None) != place.shape and np.shape(values) != place.shape:
+        raise InvalidInputError(
+            what,
+            value=f"shape {np.shape(values)}",
+            limit=f"shape {place.shape}",
+            remedy="NaN stands for what was not measured",
+        )
+    place[:] = values
+
+
+def copied(measurement: Measurement, n: int) -> Measurement:
+    """Return a copy that the rig cannot change any more, of n numbers each.
+
+    Raises
+    ------
+    InvalidInputError
+        When it is not n positions, and n velocities if any.
+    """
+    q, v = np.empty(n), None if measurement.v is None else np.empty(n)
+    copy_numbers(measurement.q, q, "measured q")
+    if v is not None and measurement.v is not None:
+        copy_numbers(measurement.v, v, "measured v")
+    return Measurement(float(measurement.t), q, v)
 
 
 class Rig(Protocol):
@@ -220,13 +254,17 @@ def check_rig(rig: Rig, mechanism: Mechanism, name: str = "rig of one's own") ->
             limit="an undertow.plants.Measurement",
             remedy="Is it connected, and switched on?",
         ) from error
-    q: Any = getattr(measurement, "q", None)
-    shape = np.shape(q)
-    names = [c.name for c in mechanism.coordinates]
-    if shape != (mechanism.n,):
+    try:
+        copied(measurement, mechanism.n)
+    except Exception as error:  # a driver may say anything
+        said = error_text(error)
+        if isinstance(error, InvalidInputError):
+            said = f"{error.what} of {error.value}"
+        names = ", ".join(c.name for c in mechanism.coordinates)
         raise InvalidInputError(
             f"first reading of '{name}'",
-            value=f"{type(measurement).__name__} with q of shape {shape}",
-            limit=f"undertow.plants.Measurement with q = ({', '.join(names)})",
-            remedy="Positions in rad or m, in that order, NaN where a sensor gave nothing",
-        )
+            value=f"{type(measurement).__name__}, {said}",
+            limit=f"undertow.plants.Measurement with q = ({names})",
+            remedy="Positions in rad or m, in that order, NaN where a sensor gave nothing, and the "
+            "rig's time, s",
+        ) from error

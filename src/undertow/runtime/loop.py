@@ -18,6 +18,7 @@ from undertow.cascade import Legs
 from undertow.law import SetPoints
 from undertow.models import FloatArray, invariant_coordinates
 from undertow.plants import Measurement, OutputOnError, Rig
+from undertow.plants.interface import copied
 from undertow.runtime.clock import (
     SECOND,
     YIELD,
@@ -402,7 +403,7 @@ class Runtime:
             return None, self._watchdog_alarm
         settings, measurement, what = self.controller.settings, None, ""
         try:
-            measurement = _copied(self.rig.read(), self.controller.x.shape[0] // 2)
+            measurement = copied(self.rig.read(), self.controller.x.shape[0] // 2)
         except Exception as error:
             what = f"read: {error_text(error)}"
             self._log_event("rig", what)
@@ -554,16 +555,6 @@ class Runtime:
             yield
         finally:
             over.set()
-
-
-def _copied(measurement: Measurement, n: int) -> Measurement:
-    """Return a copy that the rig cannot change any more, of numbers in the right shape."""
-    q = np.array(measurement.q, dtype=float)
-    v = None if measurement.v is None else np.array(measurement.v, dtype=float)
-    for values in (q,) if v is None else (q, v):
-        if values.shape != (n,):
-            raise ValueError(f"a measurement of shape {values.shape}, not ({n},)")
-    return Measurement(float(measurement.t), q, v)
 
 
 @contextlib.contextmanager

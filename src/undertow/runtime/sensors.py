@@ -16,9 +16,9 @@ import math
 from functools import lru_cache
 from typing import Any
 
-from undertow.base import InvalidInputError
 from undertow.models import FloatArray, Mechanism, fastest_rate
 from undertow.plants import Measurement
+from undertow.plants.interface import copy_numbers
 from undertow.plants.stepping import compiled_module
 from undertow.runtime.settings import Settings
 from undertow.symbolic import BRIEF, COMPILED, Workspace, unpacked
@@ -243,26 +243,14 @@ class SensorMonitor:
         stamp, accepted = math.nan, self._accepted
         if measurement is not None:
             stamp = float(measurement.t)
-            self._take(measurement.q, self._q)
+            copy_numbers(measurement.q, self._q, "measured q")
             if measurement.v is not None:
-                self._take(measurement.v, self._v)
+                copy_numbers(measurement.v, self._v, "measured v")
             accepted.v = None if measurement.v is None else self._v
         found, where, self.missing, self.first, accepted.t, self.probe = self._check(
             stamp, x, u, self._block
         )
         return (None if found in (NOT_YET, NEVER) else accepted), found, where
-
-    @staticmethod
-    def _take(said: FloatArray, place: FloatArray) -> None:
-        """Copy what a rig said, whatever it is made of, if it is one number per coordinate."""
-        if len(said) != len(place):
-            raise InvalidInputError(
-                "measurement",
-                value=f"{len(said)} numbers",
-                limit=f"{len(place)}, one per coordinate",
-                remedy="NaN stands for what was not measured",
-            )
-        place[:] = said
 
     def describe(self, found: int, where: int) -> str:
         """Return in words what :meth:`check` found."""
