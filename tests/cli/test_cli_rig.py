@@ -213,6 +213,12 @@ class Dead(Three):
 
 class Port(Three):
     def __init__(self): raise OSError(2, "no such port")
+
+class Clings(Three):
+    def __init__(self): super().__init__(2)
+    def close(self):
+        super().close()
+        raise OSError(16, "busy")
 """
 
 
@@ -224,7 +230,8 @@ class Port(Three):
         ("Quick", "--period 0.0005"),
         ("Dead", "unplugged"),
         ("Port", "no such port"),
-        ("Nobody", "no name 'Nobody', must be one of NoRead, Three, Quick, Dead, Port"),
+        ("Clings", "close() of"),
+        ("Nobody", "no name 'Nobody', must be one of NoRead, Three, Quick, Dead, Port, "),
     ],
 )
 def test_what_is_no_driver_is_refused_before_anything_runs(

@@ -83,6 +83,8 @@ class RealisticRig:
         self._t, self._lateness, self._samples = 0.0, 0.0, 0
         self._row = _BLOCK
         measure(0, memory["past"], 0, memory["encoder"], memory["phase"], self._draw()[1:], self._q)
+        if not self._module.advance.signatures:  # compiled before a period that has to be kept
+            self.copied().write(np.zeros(m))
 
     def _use(self, memory: Workspace) -> None:
         """Work on a memory: what the rig is like, and where it is."""

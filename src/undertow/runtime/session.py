@@ -9,7 +9,14 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
-from undertow.base import InvalidInputError, checked, positive
+from undertow.base import (
+    ArtefactError,
+    InvalidInputError,
+    checked,
+    error_text,
+    positive,
+    raised_at,
+)
 from undertow.cascade import Cascade, CascadeState
 from undertow.estimators import MakeEstimator
 from undertow.law import Reference, SetPoints, Target
@@ -50,6 +57,8 @@ def rig_named(word: str, recipe: Recipe, *, supervised: bool) -> Rig | None:
     ------
     InvalidInputError
         For another word, and for a driver of another period than the fast loop's.
+    ArtefactError
+        For a driver that cannot be made, read and closed.
     """
 
     def held(make: Callable[[], Rig]) -> Rig:
@@ -59,17 +68,26 @@ def rig_named(word: str, recipe: Recipe, *, supervised: bool) -> Rig | None:
         return held(recipe.make_rig) if supervised else None
     if in_a_file(word):
         plant = rig_from_file(word, recipe.belief)
-        if not math.isclose(plant.period, recipe.period, rel_tol=1e-9):
-            plant.close()
-            raise InvalidInputError(
-                f"period of '{word}'",
-                value=f"{plant.period:g} s",
-                limit=f"that of the fast loop, {recipe.period:g} s",
-                remedy=f"Write --period {plant.period:g}",
-            )
+        with closed_on_failure(plant) as kept:
+            if not math.isclose(plant.period, recipe.period, rel_tol=1e-9):
+                raise InvalidInputError(
+                    f"period of '{word}'",
+                    value=f"{plant.period:g} s",
+                    limit=f"that of the fast loop, {recipe.period:g} s",
+                    remedy=f"Write --period {plant.period:g}",
+                )
+            kept.clear()
         if not supervised:
             return plant
-        plant.close()  # it can be made; now the process that will hold it makes it
+        try:
+            plant.close()  # it can be made; now the process that will hold it makes it
+        except Exception as error:  # a driver may do anything
+            raise ArtefactError(
+                f"close() of '{word}', before the run",
+                value=f"{error_text(error)}{raised_at(error)}",
+                limit="a rig that is let go of and opened again by the supervisor",
+                remedy="Mend it, or write --no-supervisor",
+            ) from error
         return held(lambda: rig_from_file(word, recipe.belief))
     if word == "mujoco" or _is_mjcf(Path(word)):
         data = DataName.of(recipe.mechanism) if isinstance(recipe.mechanism, str) else None

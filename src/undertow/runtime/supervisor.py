@@ -29,7 +29,7 @@ from undertow.runtime.steps import limit_output
 #: Outputs that wait for the supervisor at most.
 QUEUE = 100
 
-SILENT = "the supervisor does not answer"
+SILENT = "the supervisor does not answer (a read or write of the rig may take too long)"
 
 #: How long a rig that takes no output is asked again to take zero, s; and how long the
 #: supervisor is waited for besides.
