@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from undertow.plants import (
     RealisticRig,
     Timing,
     plausible_rig,
+    simulated,
     srv02_rig,
 )
 
@@ -314,6 +316,25 @@ def test_a_copy_of_a_rig_goes_on_by_itself() -> None:
     assert np.array_equal(rig.truth, before)
     assert np.array_equal(_run(rig, inputs[100:]), path)
     assert rig.read().q.tolist() == twin.read().q.tolist()
+
+
+def test_a_rig_is_compiled_when_it_is_made(
+    arm: ut.Mechanism, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its first period is as short as others: in a run it has to be kept; and it has not moved."""
+    made: list[float] = []
+
+    class Slow:
+        signatures: tuple[object, ...] = ()
+
+        def __call__(self, t: float, *_: object) -> None:
+            made.append(t)
+
+    monkeypatch.setattr(simulated, "stepping", lambda _: SimpleNamespace(advance=Slow()))
+    rig = IdealRig(arm, HANGING)
+    assert made == [0.0]
+    assert rig.t == 0.0
+    assert rig.truth.tolist() == HANGING
 
 
 def test_numbers_carry_their_sources() -> None:
