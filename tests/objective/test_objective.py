@@ -138,6 +138,15 @@ def test_a_constraint_that_the_input_at_the_target_breaks_is_refused() -> None:
     strong.check_start(hoist, hoist.state(phi=0.1))
 
 
+def test_a_constraint_that_is_no_real_number_at_the_target_is_refused() -> None:
+    """In a cascade, too, which prices the room that a constraint has there."""
+    arm = ut.mechanisms.rotary_pendulum()
+    late = ut.Constraint("late", lambda v: sp.sqrt(v.phi - 0.3) - 9)
+    cascade = ut.Cascade(arm, ut.MinimumEnergy(constraints=(late,)))
+    with pytest.raises(InvalidInputError, match=r"target x = 0.*'late': got margin nan"):
+        cascade.start(arm.state(phi=0.4))
+
+
 def test_a_start_where_a_constraint_is_no_number_is_refused(rig: ut.Mechanism) -> None:
     """ln(φ − 5) is complex below 5."""
     odd = ut.Constraint("odd", lambda v: sp.log(v.phi - 5))

@@ -51,6 +51,7 @@ from undertow.law import (
 )
 from undertow.models import FloatArray, Mechanism, has_linear_model, steps_in
 from undertow.objective import MinimumEnergy, Objective
+from undertow.objective.objective import real_value
 
 #: Relative tolerance of motions that are shown, and that decide.
 RTOL = 1e-9
@@ -512,10 +513,10 @@ class ClosedLoop:
         full = known | dict(zip(mechanism.u, self.input_limits.tolist(), strict=True))
         rate = float(objective.stage_cost(mechanism).subs(full))
         room = [
-            math.inf if margin.free_symbols & inputs else float(margin.subs(known))
+            math.inf if margin.free_symbols & inputs else real_value(margin.subs(known))
             for margin in margins
         ]
-        return (rate if 0.0 < rate < math.inf else 1.0) / np.maximum(room, LEAST_ROOM)
+        return (rate if 0.0 < rate < math.inf else 1.0) / np.fmax(room, LEAST_ROOM)
 
     def _begun(
         self, buffers: RolloutBuffers, stable_only: bool, linearised: bool

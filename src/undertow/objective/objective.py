@@ -688,7 +688,7 @@ class Objective:
                 found = margin.subs(values)
                 if not found.is_number:
                     continue  # it depends on the input
-                value = _real(found)
+                value = real_value(found)
                 if not value >= 0:
                     raise InvalidInputError(
                         f"{which} of '{mechanism.name}' breaks '{constraint.words}'",
@@ -829,10 +829,11 @@ def margins_at(
     """Return the constraints' margins at a state, (2n,), under an input, (m,); NaN for none."""
     values = zip([*mechanism.x, *mechanism.u], [*x.tolist(), *u.tolist()], strict=True)
     known = mechanism.substitution | dict(values)
-    return [_real(margin.subs(known)) for margin in objective.path_margins(mechanism)]
+    return [real_value(margin.subs(known)) for margin in objective.path_margins(mechanism)]
 
 
-def _real(value: sp.Expr) -> float:
+def real_value(value: sp.Expr) -> float:
+    """Return a number as it is, NaN for one that is complex or infinite."""
     return float(value) if value.is_real else math.nan
 
 
