@@ -136,7 +136,7 @@ class RolloutBuffers:
             if ensemble.state_error_part < math.inf:
                 most = ensemble.state_error_part * np.linalg.norm(buffers.states, axis=1)
                 sizes = np.maximum(np.linalg.norm(errors, axis=1), np.finfo(float).tiny)
-                errors = np.minimum(1.0, most / sizes)[:, None] * errors
+                errors = (np.minimum(sizes, most) / sizes)[:, None] * errors
             buffers.states += errors
         return buffers
 
