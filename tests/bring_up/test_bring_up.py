@@ -173,6 +173,7 @@ def test_wirings_found_one_behind_the_other_are_one_wiring() -> None:
     [
         ((), set()),
         (("voltage=-1",), {("input sign", "voltage")}),
+        (("voltage=3",), {("input scale", "voltage")}),
         (("theta=-1",), {("encoder sign", "theta")}),
         (("phi=-1",), {("encoder sign", "phi")}),
         (("theta=4",), {("encoder scale", "theta")}),
@@ -186,7 +187,7 @@ def test_wirings_found_one_behind_the_other_are_one_wiring() -> None:
 def test_faults_on_other_rigs(
     fault: tuple[str, ...], found: set[tuple[str, str]], seed: int
 ) -> None:
-    """Ten wirings on two rigs with other parameters, zeros and noise."""
+    """Eleven wirings on two rigs with other parameters, zeros and noise."""
     assert wrong(wizard(*fault, seed=seed)) == found
 
 
@@ -285,6 +286,13 @@ def test_encoder_scales_near_a_known_one_are_that_one() -> None:
     for measured, setting in ((0.206, 0.25), (0.6, 0.5), (-3.3, -4.0), (50.0, 180 / np.pi)):
         _, found = explain(np.array([[1.0, measured]]), np.ones((1, 2), dtype=bool))
         assert found.encoders[1] == setting
+
+
+def test_one_factor_of_an_input_explains_gains_on_either_side_of_it() -> None:
+    """An amplifier of three times the gain, whose motion is half as strong again in one joint."""
+    _, found = explain(np.array([[1.79, 2.99]]), np.ones((1, 2), dtype=bool))
+    assert found.encoders.tolist() == [1.0, 1.0]
+    assert 1.79 < found.inputs[0] < 2.99
 
 
 @pytest.mark.parametrize(("pushed", "dead"), [(0.02, False), (0.5, True)])

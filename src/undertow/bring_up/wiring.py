@@ -120,7 +120,7 @@ def explain(gain: FloatArray, known: FloatArray) -> tuple[float, Wiring]:
     choices = []
     for i in range(m):
         moved = [g for g in gain[i][live[i]].tolist() if abs(g) > DEAD]
-        choices.append([1.0] if dead[i] else [1.0, -1.0, *moved])
+        choices.append([1.0] if dead[i] else [1.0, -1.0, *moved, *_between(moved)])
     best: tuple[float, FloatArray, FloatArray] | None = None
     for k in itertools.product(*choices):
         encoders = np.ones(n)
@@ -141,6 +141,15 @@ def explain(gain: FloatArray, known: FloatArray) -> tuple[float, Wiring]:
     inputs = np.array([_rounded(v) for v in best[1]])
     inputs[dead] = 0.0
     return best[0], Wiring(inputs, best[2])
+
+
+def _between(gains: list[float]) -> list[float]:
+    """Return the factor in the middle of the gains of one input, of either sign, if it is wrong.
+
+    One factor explains gains on either side of it by the tolerance.
+    """
+    middle = math.exp(float(np.mean(np.log(np.abs(gains))))) if gains else 1.0
+    return [middle, -middle] if abs(_rounded(middle)) != 1.0 else []
 
 
 def _faults(factor: float) -> int:

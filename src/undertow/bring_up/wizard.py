@@ -275,8 +275,10 @@ class _Wizard:
             sign = "as the model" if factor > 0 else "reversed"
             swap = f"Swap the leads of {name}, or negate it in the driver"
             self._add(f"{kind} sign", name, sign, "as the model", bool(factor > 0), swap)
-            words, times = known_factor(factor), f"{abs(seen):.3g} times the model's"
-            divide = f"Divide by {abs(factor):.3g}" + f": it looks like {words}" * bool(words)
+            words = known_factor(factor) if kind == "encoder" else ""
+            times = f"{abs(seen):.3g} times the model's"
+            by = abs(factor if words else seen)
+            divide = f"Divide by {by:.3g}" + f": it looks like {words}" * bool(words)
             right = abs(factor) == 1.0
             self._add(f"{kind} scale", name, times, "1 within 45 %", bool(right), divide)
 
