@@ -474,6 +474,71 @@ def test_the_wizard_meets_a_driver_of_ones_own(
     assert "a simulated rig" in refused.output
 
 
+FAILING = (
+    DRIVER
+    + """
+
+class Gaps(Driver):  # one reading of fifty is lost
+    def read(self):
+        measured = super().read()
+        self.count = getattr(self, "count", 0) + 1
+        if self.count % 50 == 0:
+            measured.q[1] = np.nan
+        return measured
+
+class Lost(Driver):  # while it is pushed
+    on = False
+    def read(self):
+        measured = super().read()
+        if self.on:
+            measured.q[1] = np.nan
+        return measured
+    def write(self, u):
+        self.on = self.on or bool(u[0])
+        super().write(u)
+
+class Dies(Driver):
+    def write(self, u):
+        if u[0]:
+            raise RuntimeError("bus error")
+        super().write(u)
+
+class Clings(Driver):
+    def close(self):
+        raise RuntimeError("busy")
+"""
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("Gaps", "Wrong: input sign of voltage"),
+        ("Lost", "error: reading of coordinate 1 of the rig: got no number"),
+        ("Dies", "error: write() of the rig: got RuntimeError: bus error, "),
+        ("Clings", "Wrong: input sign of voltage"),
+    ],
+)
+def test_the_wizard_meets_a_driver_that_fails(
+    name: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It says so in one line; what is lost for a moment is bridged; no finding is thrown away."""
+    (tmp_path / "driver.py").write_text(FAILING)
+    monkeypatch.setattr("undertow.bring_up.faults.Paced", lambda rig: rig)  # needs no clock
+    words_given = [
+        "bench",
+        "rotary_pendulum",
+        "--quick",
+        "--rig",
+        f"{tmp_path / 'driver.py'}:{name}",
+    ]
+    result = CliRunner().invoke(app, words_given)
+    assert result.exit_code == 1
+    assert words in " ".join(result.output.split())
+    assert ("moves nothing" in result.output) is False
+    assert ("close() of the rig: got RuntimeError: busy" in result.output) is (name == "Clings")
+
+
 def test_hardware_is_asked_at_its_own_pace() -> None:
     rig = Paced(IdealRig(ut.mechanisms.rotary_pendulum(), period=0.002))
     began = time.perf_counter()

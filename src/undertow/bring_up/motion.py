@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undertow.base import InfeasibleError, UndertowError
+from undertow.base import ArtefactError, InfeasibleError, UndertowError
 from undertow.models import FloatArray, Mechanism, steps_in
 from undertow.plants import Rig, control_loop
 from undertow.plants.stepping import RIG_LAYOUT, stepping
@@ -99,7 +99,9 @@ def perform(
     Raises
     ------
     GuardError
-        When one goes further, or is not measured any more: the inputs are zero then.
+        When one goes further: the inputs are zero then.
+    ArtefactError
+        When one is not measured any more: so they are then.
     """
     times: list[float] = []
     positions: list[FloatArray] = []
@@ -109,8 +111,15 @@ def perform(
             times.append(measured.t)
             positions.append(np.array(measured.q, dtype=float))
             away = np.abs(positions[-1] - positions[0])
-            if not (away <= guard).all():
-                worst = int(np.argmax(~(away <= guard)))
+            if np.isnan(away).any():
+                raise ArtefactError(
+                    f"reading of coordinate {int(np.argmax(np.isnan(away)))} of the rig",
+                    value="no number",
+                    limit="a position in rad or m",
+                    remedy="The inputs are zero now: look at the encoder's cable and supply",
+                )
+            if (away > guard).any():
+                worst = int(np.argmax(away > guard))
                 raise GuardError(
                     f"coordinate {worst} of the rig",
                     value=f"{away[worst]:.3g} from where it began",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -30,7 +31,8 @@ from undertow.bring_up.wiring import (
     push_response,
 )
 from undertow.models import FloatArray, Mechanism
-from undertow.plants import Rig, control_loop
+from undertow.plants import Measurement, Rig, RigWrapper, control_loop
+from undertow.plants.interface import copied, driver_errors
 
 #: Shares of an input's limit that are tried, from the smallest, until something moves.
 SHARES = (0.05, 0.08, 0.12, 0.18, 0.25, 0.35, 0.5)
@@ -50,6 +52,9 @@ LOOK = 1.0
 
 #: Longest wait for rest between two motions, s: a good joint swings for minutes.
 CALM = 240.0
+
+#: What is not measured for no longer than this, s, is taken to be as it was.
+GAP = 0.02
 
 Assessment = Literal["right", "wrong", "unclear"]
 
@@ -110,7 +115,10 @@ def bring_up(
     InfeasibleError
         When the model has no rest to start from.
     InvalidInputError
-        For a delay that is negative or no number.
+        For a delay that is negative or no number, and for readings of another number than the
+        coordinates.
+    ArtefactError
+        When a driver fails, or a coordinate is lost during a motion: the inputs are zero then.
     """
     if delay is not None:
         positive("delay of the loop as it should be, s", delay, "0.002 is 2 ms", zero=True)
@@ -130,11 +138,38 @@ def bring_up(
     return wizard.result()
 
 
+class _Driver(RigWrapper):
+    """A driver of one's own: what is not measured for a moment is as it was; errors in words."""
+
+    def __init__(self, rig: Rig, n: int) -> None:
+        super().__init__(rig)
+        self._last, self._gap = np.full(n, np.nan), np.zeros(n)
+
+    def _said(self, call: str) -> AbstractContextManager[None]:
+        remedy = "The inputs were set to zero, if it took that: look at the driver"
+        return driver_errors(f"{call} of the rig", "a rig that does what it is asked", remedy)
+
+    def read(self) -> Measurement:
+        """Return the measurement, without the gaps that are shorter than ``GAP``."""
+        with self._said("read()"):
+            measured = copied(self.rig.read(), len(self._last))
+        missing = ~np.isfinite(measured.q)
+        self._gap = np.where(missing, self._gap + self.period, 0.0)
+        measured.q[missing] = np.where(self._gap > GAP, np.nan, self._last)[missing]
+        self._last = measured.q.copy()
+        return measured
+
+    def write(self, u: FloatArray) -> None:
+        """Apply the inputs u, (m,)."""
+        with self._said("write()"):
+            self.rig.write(u)
+
+
 class _Wizard:
     """The state of one bring-up: findings so far, the rig as it is understood."""
 
     def __init__(self, rig: Rig, belief: Mechanism, rest: FloatArray) -> None:
-        self.rig, self.belief, self.rest = rig, belief, rest
+        self.rig, self.belief, self.rest = _Driver(rig, belief.n), belief, rest
         self.findings: list[RigFinding] = []
         self.wiring: Wiring | None = None
         self.identification: Identification | None = None

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Group
 
@@ -20,6 +22,9 @@ from undertow.cli.terminal import (
     write,
 )
 from undertow.models.importers.python_file import in_a_file
+
+if TYPE_CHECKING:
+    from undertow.plants import Rig
 
 
 @command(
@@ -76,7 +81,7 @@ def bench(
     plant = rig_named(rig, belief, mechanism_named(name), rest, faults, seed)
     if delay is None and isinstance(plant, RealisticRig):
         delay = plant.bench.timing.input_delay + plant.bench.timing.measurement_delay
-    with closing(plant):
+    with _closed(plant):  # after what was found is shown: that may fail
         if in_a_file(rig):
             ready = f"Ready. Let {name} come to rest, hands off, and press Enter."
             exit_unless(enter_pressed(ready))
@@ -89,10 +94,22 @@ def bench(
                 learn=not quick,
                 progress=progress,
             )
-    table = findings_table(found)
-    written = write(out, lambda: files(request, belief, rest, found), table)
-    show(table)
-    if found.identification is not None:
-        show(Group("", parameter_table(found.identification)))
-    show(*summary(found), *written)
-    exit_unless(not found.wrong)
+        table = findings_table(found)
+        written = write(out, lambda: files(request, belief, rest, found), table)
+        show(table)
+        if found.identification is not None:
+            show(Group("", parameter_table(found.identification)))
+        show(*summary(found), *written)
+        exit_unless(not found.wrong)
+
+
+@contextmanager
+def _closed(plant: Rig) -> Iterator[None]:
+    """Close a rig in the end."""
+    from undertow.plants.interface import driver_errors
+
+    try:
+        yield
+    finally:
+        with driver_errors("close() of the rig", "a rig that is let go of", "Look at the device"):
+            plant.close()

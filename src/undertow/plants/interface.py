@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from numbers import Real
 from typing import Any, Protocol
@@ -39,6 +39,24 @@ class Measurement:
     t: float
     q: FloatArray
     v: FloatArray | None = None
+
+
+@contextmanager
+def driver_errors(what: str, limit: str, remedy: str) -> Iterator[None]:
+    """Turn what a driver raises, which may be anything, into one condition.
+
+    Raises
+    ------
+    ArtefactError
+        With the driver's own words, and where it raised.
+    """
+    try:
+        yield
+    except UndertowError:  # said already
+        raise
+    except Exception as error:
+        said = f"{error_text(error)}{raised_at(error)}"
+        raise ArtefactError(what, value=said, limit=limit, remedy=remedy) from error
 
 
 def copy_numbers(values: ArrayLike, place: FloatArray, what: str) -> None:
@@ -245,15 +263,11 @@ def check_rig(rig: Rig, mechanism: Mechanism, name: str = "rig of one's own") ->
     modelled = getattr(rig, "mechanism", None)
     if isinstance(modelled, Mechanism):
         mechanism.check_plant(modelled)
-    try:
+    first = f"first reading of '{name}'"
+    with driver_errors(
+        first, "an undertow.plants.Measurement", "Is it connected, and switched on?"
+    ):
         measurement: Any = rig.read()
-    except Exception as error:  # a driver may do anything
-        raise ArtefactError(
-            f"first reading of '{name}'",
-            value=f"{error_text(error)}{raised_at(error)}",
-            limit="an undertow.plants.Measurement",
-            remedy="Is it connected, and switched on?",
-        ) from error
     try:
         copied(measurement, mechanism.n)
     except Exception as error:  # a driver may say anything
@@ -262,7 +276,7 @@ def check_rig(rig: Rig, mechanism: Mechanism, name: str = "rig of one's own") ->
             said = f"{error.what} of {error.value}"
         names = ", ".join(c.name for c in mechanism.coordinates)
         raise InvalidInputError(
-            f"first reading of '{name}'",
+            first,
             value=f"{type(measurement).__name__}, {said}",
             limit=f"undertow.plants.Measurement with q = ({names})",
             remedy="Positions in rad or m, in that order, NaN where a sensor gave nothing, and the "

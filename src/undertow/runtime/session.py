@@ -9,14 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
-from undertow.base import (
-    ArtefactError,
-    InvalidInputError,
-    checked,
-    error_text,
-    positive,
-    raised_at,
-)
+from undertow.base import InvalidInputError, checked, positive
 from undertow.cascade import Cascade, CascadeState
 from undertow.estimators import MakeEstimator
 from undertow.law import Reference, SetPoints, Target
@@ -25,6 +18,7 @@ from undertow.models import StateLike
 from undertow.models.importers.formats import FORMATS, MJCF
 from undertow.models.importers.python_file import in_a_file
 from undertow.plants import IdealRig, MuJoCoRig, Rig, check_rig, rig_from_file
+from undertow.plants.interface import driver_errors
 from undertow.runtime.clock import SimulatedClock, WallClock
 from undertow.runtime.encoding import Columns
 from undertow.runtime.log import Log, check_log
@@ -79,15 +73,12 @@ def rig_named(word: str, recipe: Recipe, *, supervised: bool) -> Rig | None:
             kept.clear()
         if not supervised:
             return plant
-        try:
+        with driver_errors(
+            f"close() of '{word}', before the run",
+            "a rig that is let go of and opened again by the supervisor",
+            "Mend it, or write --no-supervisor",
+        ):
             plant.close()  # it can be made; now the process that will hold it makes it
-        except Exception as error:  # a driver may do anything
-            raise ArtefactError(
-                f"close() of '{word}', before the run",
-                value=f"{error_text(error)}{raised_at(error)}",
-                limit="a rig that is let go of and opened again by the supervisor",
-                remedy="Mend it, or write --no-supervisor",
-            ) from error
         return held(lambda: rig_from_file(word, recipe.belief))
     if word == "mujoco" or _is_mjcf(Path(word)):
         data = DataName.of(recipe.mechanism) if isinstance(recipe.mechanism, str) else None
