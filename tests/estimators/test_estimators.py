@@ -241,11 +241,12 @@ def test_readings_may_be_made_of_anything_but_not_of_another_number(
 ) -> None:
     """Lists, single precision; one too many once ended the process, an infinity the estimate."""
     expected = None
-    for make in (np.array, list, np.float32):
+    makes: tuple[Any, ...] = np.array, list, np.float32
+    for make in makes:
         estimator = kind(arm)
         estimator.reset([0.0, 0.25, 0.0, 0.0])
         for k in range(3):
-            x = estimator.estimate(Measurement(k * PERIOD, make([0.0, 0.25])), [0.5]).copy()
+            x = estimator.estimate(Measurement(k * PERIOD, make([0.0, 0.25])), make([0.5])).copy()
         expected = x if expected is None else expected
         np.testing.assert_array_equal(x, expected)
     for k in range(3, 6):
