@@ -55,6 +55,13 @@ def test_a_run_is_logged_and_its_replay_is_identical(tmp_path: Path) -> None:
     code, out, _ = run("replay", str(log), "--no-decisions")
     assert code == 1
     assert "1 steps differ, the first is 100" in out
+    with sqlite3.connect(log) as file:
+        file.execute("DELETE FROM steps")
+    file.close()
+    code, out, _ = run("replay", str(log))
+    assert code == 1
+    assert "nothing to compare" in out
+    assert "identical" not in out
 
 
 @pytest.mark.parametrize(

@@ -110,7 +110,9 @@ def replay_table(result: Replay) -> Table:
         t, text = stops[-1]
         stopped = f"{text.partition('SAFE_STOP: ')[2]}, at {t:.3f} s"
     same = f"identical, bit for bit{', to the gap' if result.gap is not None else ''}"
-    if result.differing:
+    if not result.steps:
+        same = "nothing to compare: no step was made again"
+    elif result.differing:
         same = f"{result.differing:,} steps differ, the first is {result.first}"
     otherwise = f"{result.misjudged:,} otherwise" if result.misjudged else "all as before"
     rows += [
