@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -119,6 +120,23 @@ def test_a_measurement_of_another_shape_is_a_safe_stop(controller: Controller, q
     controller.step(Inputs(1e-3 * k, Measurement(1e-3 * k, q)))  # type: ignore[arg-type]
     assert controller.mode == Mode.SAFE_STOP
     assert controller.stopped_by
+
+
+@pytest.mark.parametrize("wrong", [lambda x: x[:3], lambda x: [*x, 0.0], lambda _: None])
+def test_an_estimate_of_another_shape_is_a_safe_stop(
+    wrong: Callable[[np.ndarray], object], controller: Controller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One's own estimator: compiled code would read what lies behind a state that is too short."""
+    k, honest = settled(controller), controller.estimator.estimate
+    for change in (list, wrong):
+        monkeypatch.setattr(
+            controller.estimator, "estimate", lambda m, u, to=change: to(honest(m, u))
+        )
+        assert controller.mode is not Mode.SAFE_STOP
+        controller.step(Inputs(1e-3 * k, Measurement(1e-3 * k, np.array([0.0, 0.3]))))
+        k += 1
+    assert controller.mode is Mode.SAFE_STOP
+    assert "estimated state: got shape" in controller.stopped_by
 
 
 def test_from_hanging_to_balance_through_the_states_and_the_same_again(tmp_path: Path) -> None:

@@ -72,7 +72,7 @@ def copy_numbers(values: ArrayLike, place: FloatArray, what: str) -> None:
             what,
             value=f"shape {np.shape(values)}",
             limit=f"shape {place.shape}",
-            remedy="NaN stands for what was not measured",
+            remedy="NaN stands for what is not known",
         )
     place[:] = values
 

@@ -25,6 +25,7 @@ from undertow.law import InnerLoop, ReferenceMotion
 from undertow.models import FloatArray, error_dynamics
 from undertow.optimiser import Proposal
 from undertow.plants import Measurement
+from undertow.plants.interface import copy_numbers
 from undertow.runtime.modes import Command, Mode, Reason
 from undertow.runtime.plan_check import PlanCheck
 from undertow.runtime.sensors import LAST_HARMLESS, SensorMonitor
@@ -183,6 +184,7 @@ class Controller:
         self._packed = self._law_vectors
         self._since = fast["since"]
         self._expected, self._off = fast["expected"], fast["off"]
+        self._estimate, self._disturbance = np.zeros_like(self.x), np.zeros_like(self.u)
         self._max_error = self._due = 0.0
         self._asked: Request | None = None
         self._pending: Answer | None = None
@@ -302,7 +304,9 @@ class Controller:
         if accepted is not None:
             if sensors.first:
                 self.estimator.reset(np.concatenate([accepted.q, np.zeros_like(accepted.q)]))
-            estimate = self.estimator.estimate(accepted, self.u)
+            estimate = self._estimate  # one's own estimator may return anything
+            copy_numbers(self.estimator.estimate(accepted, self.u), estimate, "estimated state")
+            copy_numbers(self.estimator.disturbance, self._disturbance, "estimated disturbance")
             if self._learning is not None and sensors.first:
                 values = self.cascade.mechanism.parameter_values
                 self._parameters[:] = self._bears.parameters[:] = values
@@ -324,7 +328,7 @@ class Controller:
             waited = self._waiting()
         used, number, why, wrong, place = self._act(
             estimate,
-            self.estimator.disturbance,
+            self._disturbance,
             self._law_vector,
             new,
             most,
