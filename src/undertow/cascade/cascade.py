@@ -256,14 +256,13 @@ class Cascade:
         """Whether plans are for the estimate alone, and later decisions mend them for the plant.
 
         What arrives without sliding in does so on one plant only: no mean over an ensemble says
-        what it is worth.  Nor does it bear errors of the state, but a schedule is asked for.
+        what it is worth.  And what suits every plausible plant costs more than what is planned
+        anew as the plant is learnt.  But such plans do not bear errors of the state, so single
+        surfaces have recourse where states are exact; schedules have it for least time alone.
         """
-        return (
-            self.known is not None
-            and self.planner is None
-            and (self.freedom.schedule > 0 or self.covariance is None)
-            and self.loop.price_of_time > 0
-        )
+        scheduled = self.freedom.schedule > 0
+        bears = self.loop.price_of_time > 0 if scheduled else self.covariance is None
+        return self.known is not None and self.planner is None and bears
 
     # -- what it is made of -----------------------------------------------------------------
 

@@ -75,7 +75,7 @@ class Judge:
             return False
         estimated = self.predictions.estimated_at(state)
         arrives = estimated.batch(error, plan, duration=span, precise=True).reached[0]
-        return bool(arrives) and self.reserve.recovers(loop, error, plan)
+        return bool(arrives) and self.reserve.recovers(loop, error, span, plan)
 
     def breaks(
         self, state: CascadeState, plans: list[Plan], error: FloatArray, span: float

@@ -127,8 +127,10 @@ class Planning:
             begun = CascadeState(plan, number, cost, cost, t, as_numbers(x), known, target)
             good = math.isfinite(cost) and math.isinf(judge.breaks(begun, [plan], x, horizon)[0][0])
             if loop is not whole:  # every plausible plant lives to see the next decision
-                lives = judge.survives if loop.ensemble is not None else judge.reserve.recovers
-                good &= lives(here, x, plan)
+                if loop.ensemble is not None:
+                    good &= judge.survives(here, x, plan)
+                else:
+                    good &= judge.reserve.recovers(here, x, horizon, plan)
             if loop.ensemble is None and planners.own is None:
                 good &= cost <= AGREES * proposal.cost
             tries.append(Found(0 if good else 1 if loop is whole else 2, cost, proposal))
@@ -146,7 +148,7 @@ class Planning:
             k = int(np.argmin(costs))
             plan, cost = plans[k], costs[k]
         begun = CascadeState(plan, number, cost, cost, t, as_numbers(x), known, target)
-        mends = planners.recourse and planners.own is None
+        mends = planners.recourse and here.price_of_time > 0
         if mends and best.rank < 3 and not (target is not None and target.moves):
             begun = replace(begun, ahead=self._ahead(begun, x, horizon))
         return begun, replace(proposal, sequence=number)
@@ -227,11 +229,13 @@ class Planning:
                 "computed_for": t,
                 "resolution": self.resolution * state.scale,
             }
-            if planners.recourse:
+            first = state.predicted == state.scale  # nothing was decided since
+            timed = loop.price_of_time > 0
+            # One period shows little of the plant: what suits all costs less then than a guess.
+            if planners.recourse and (timed or not first):
                 estimated = predictions.estimated(state.estimate)
                 optimiser = planners.optimiser_of(estimated, state.target, t)
-                admits = partial(judge.reserve.recovers, loop, error)
-                first = state.predicted == state.scale  # nothing was decided since
+                admits = partial(judge.reserve.recovers, loop, error, span)
                 spent = (t - state.since) * loop.price_of_time
                 promised = 0.0 if first else state.predicted - spent
                 begins = [(used, promised)]

@@ -15,6 +15,10 @@ from undertow.models import FloatArray
 #: target all are the same feedback, far from it each asks for more input before it saturates.
 STRONGER = (1.0, 2.0, 4.0, 8.0)
 
+#: Part of the time left within which a plan in reserve is to arrive where another than that is in
+#: use: what has to hurry in the end costs much more than what is planned a little sooner.
+ROOM = 0.8
+
 
 class Reserve:
     """The first surface, reached ever more strongly.
@@ -60,7 +64,14 @@ class Reserve:
         best = min(range(len(ranks)), key=ranks.__getitem__)
         return self.plans[best - 1] if best else None
 
-    def recovers(self, loop: ClosedLoop, error: FloatArray, plan: Plan) -> bool:
-        """Whether one would bring every plausible plant home after the next period of a plan."""
-        plans = [plan.followed_by(last, self.period, self.reaching) for last in self.plans]
-        return bool(loop.batch(error, plans).reached.any())
+    def recovers(self, loop: ClosedLoop, error: FloatArray, span: float, plan: Plan) -> bool:
+        """Whether a plan brings every plausible plant home in time, or leaves room for another.
+
+        There is room as long as one of these, after a period of the plan, needs no more than
+        ``ROOM`` of the time that is left.
+        """
+        then = [plan.followed_by(last, self.period, self.reaching) for last in self.plans]
+        return bool(
+            loop.batch(error, then, duration=ROOM * span).reached.any()
+            or loop.batch(error, plan, duration=span).reached[0]
+        )
