@@ -40,7 +40,7 @@ slow: $(STAMP) ## run the slow tests, or those that MINUTES leave time for
 # What is compiled runs in Python, too, for a few calls a test: tests/compiled_lines.py. Which test
 # reaches which line is kept in .coverage, where tests/mutants.py looks it up.
 coverage: $(STAMP) ## run the tests, and list the lines of src that none of them reaches
-	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal --count-compiled \
+	COVERAGE_FILE=$(CURDIR)/.coverage $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal --count-compiled \
 	    --cov=undertow --cov-context=test --cov-report=term --cov-fail-under=92
 
 check: $(STAMP) ## formatting, lint, types, direction of imports
