@@ -37,11 +37,11 @@ slow: $(STAMP) ## run the slow tests, or those that MINUTES leave time for
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m slow \
 	    $(if $(MINUTES),--minutes=$(MINUTES) --draw=$(DRAW)) || [ $$? -eq 5 ]
 
-# What is compiled runs in Python, too, for a few calls a test: tests/compiled_lines.py. Which test
-# reaches which line is kept in .coverage, where tests/mutants.py looks it up.
+# What is compiled runs in Python, too, for a moment in each test: tests/compiled_lines.py. Which
+# test reaches which line is kept in .coverage, where tests/mutants.py looks it up.
 coverage: $(STAMP) ## run the tests, and list the lines of src that none of them reaches
-	COVERAGE_FILE=$(CURDIR)/.coverage $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal --count-compiled \
-	    --cov=undertow --cov-context=test --cov-report=term --cov-fail-under=92
+	COVERAGE_FILE=$(CURDIR)/.coverage $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal \
+	    --count-compiled --cov=undertow --cov-context=test --cov-report=term --cov-fail-under=92
 
 check: $(STAMP) ## formatting, lint, types, direction of imports
 	$(BIN)/ruff format --check .

@@ -9,7 +9,8 @@ ours; the lines of all other generated modules are in no file of ours.
 from __future__ import annotations
 
 import contextlib
-from collections import Counter
+import time
+from collections import defaultdict
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -19,12 +20,12 @@ from numba.core.registry import CPUDispatcher
 
 import undertow
 
-#: Calls of one function that also run in Python, in one test: bodies are slow.
-CALLS = 4
+#: How long one function also runs in Python in one test, s of processor time; then no more calls.
+SECONDS = 0.03
 
 _PACKAGE = str(Path(undertow.__file__).parent)
 
-_counted: Counter[CPUDispatcher] = Counter()
+_spent: defaultdict[Any, float] = defaultdict(float)
 
 
 def count_compiled() -> None:
@@ -37,19 +38,20 @@ def count_compiled() -> None:
             return compiled(self, *args)
         if self.targetoptions.get("no_cpython_wrapper"):  # has no way in but from compiled code
             return self.py_func(*args)
-        _counted[self] += 1
-        if _counted[self] <= CALLS:
+        if _spent[self] < SECONDS:
+            began = time.thread_time()
             # Python refuses what compiled arithmetic does not: that body ends there.
             with contextlib.suppress(Exception), np.errstate(all="ignore"):
                 self.py_func(*map(_copy, args))
+            _spent[self] += time.thread_time() - began
         return compiled(self, *args)
 
     dispatcher.__call__ = call
 
 
 def begin_test() -> None:
-    """Count the calls of each function anew."""
-    _counted.clear()
+    """Give each function its time anew."""
+    _spent.clear()
 
 
 @cache
