@@ -71,7 +71,7 @@ $(CHECKER): checker/checker.cpp $(wildcard checker/*.hpp)
 
 clean: ## remove .venv, caches and results/
 	rm -rf $(VENV) results dist build docs/api docs/gallery
-	rm -rf .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage*
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # One environment for all targets, made afresh when what it is made from changes.
