@@ -37,8 +37,8 @@ slow: $(STAMP) ## run the slow tests, or those that MINUTES leave time for
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m slow \
 	    $(if $(MINUTES),--minutes=$(MINUTES) --draw=$(DRAW)) || [ $$? -eq 5 ]
 
-# What is compiled runs in Python, too, for a moment in each test: tests/compiled_lines.py. Which
-# test reaches which line is kept in .coverage, where tests/mutants.py looks it up.
+# What is compiled runs in Python, too, a part of the time: tests/compiled_lines.py. Which test
+# reaches which line is kept in .coverage, where tests/mutants.py looks it up.
 coverage: $(STAMP) ## run the tests, and list the lines of src that none of them reaches
 	COVERAGE_FILE=$(CURDIR)/.coverage $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal \
 	    --count-compiled --cov=undertow --cov-context=test --cov-report=term --cov-fail-under=92

@@ -9,8 +9,8 @@ ours; the lines of all other generated modules are in no file of ours.
 from __future__ import annotations
 
 import contextlib
+import math
 import time
-from collections import defaultdict
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,38 +20,39 @@ from numba.core.registry import CPUDispatcher
 
 import undertow
 
-#: How long one function also runs in Python in one test, s of processor time; then no more calls.
-SECONDS = 0.03
+#: How long what a body calls runs in Python, too, s: then only the compiled functions answer it.
+SECONDS = 0.01
+#: Times as long as a body took until the next one: what happens in real time has to go on.
+REST = 4.0
 
 _PACKAGE = str(Path(undertow.__file__).parent)
-
-_spent: defaultdict[Any, float] = defaultdict(float)
 
 
 def count_compiled() -> None:
     """Let compiled functions run in Python, too, from now on."""
     dispatcher: Any = CPUDispatcher
-    compiled = dispatcher.__call__
+    compiled, resting, nested = dispatcher.__call__, -math.inf, -math.inf  # until when
 
     def call(self: Any, *args: Any) -> Any:
+        nonlocal resting, nested
         if not _has_lines_of_ours(self):
             return compiled(self, *args)
         if self.targetoptions.get("no_cpython_wrapper"):  # has no way in but from compiled code
             return self.py_func(*args)
-        if _spent[self] < SECONDS:
-            began = time.thread_time()
+        began = time.perf_counter()
+        outermost = began >= resting
+        if outermost:
+            resting, nested = math.inf, began + SECONDS
+        if began < nested:
             # Python refuses what compiled arithmetic does not: that body ends there.
             with contextlib.suppress(Exception), np.errstate(all="ignore"):
                 self.py_func(*map(_copy, args))
-            _spent[self] += time.thread_time() - began
+        if outermost:
+            ended = time.perf_counter()
+            resting, nested = ended + REST * (ended - began), -math.inf
         return compiled(self, *args)
 
     dispatcher.__call__ = call
-
-
-def begin_test() -> None:
-    """Give each function its time anew."""
-    _spent.clear()
 
 
 @cache

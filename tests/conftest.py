@@ -49,7 +49,6 @@ BEGUN = time.monotonic()
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Leave out what comes too late, and say so."""
-    compiled_lines.begin_test()
     minutes = item.config.getoption("minutes")
     if minutes is not None and time.monotonic() - BEGUN > 60 * minutes:
         pytest.skip(f"left out after {minutes:g} minutes; make slow runs all")
