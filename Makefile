@@ -18,7 +18,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test slow check bench docs checker clean
+.PHONY: help setup demo test slow coverage check bench docs checker clean
 
 help: ## list the targets
 	@echo "Undertow: make <target>    (PYTHON=$(PYTHON), WORKERS=$(WORKERS))"
@@ -36,6 +36,12 @@ test: $(STAMP) ## run the tests, but for the slow ones
 slow: $(STAMP) ## run the slow tests, or those that MINUTES leave time for
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m slow \
 	    $(if $(MINUTES),--minutes=$(MINUTES) --draw=$(DRAW)) || [ $$? -eq 5 ]
+
+# What is compiled runs in Python, too, a part of the time: tests/compiled_lines.py. Which test
+# reaches which line is kept in .coverage, where tests/mutants.py looks it up.
+coverage: $(STAMP) ## run the tests, and list the lines of src that none of them reaches
+	COVERAGE_FILE=$(CURDIR)/.coverage $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal \
+	    --count-compiled --cov=undertow --cov-context=test --cov-report=term --cov-fail-under=92
 
 check: $(STAMP) ## formatting, lint, types, direction of imports
 	$(BIN)/ruff format --check .
@@ -65,7 +71,7 @@ $(CHECKER): checker/checker.cpp $(wildcard checker/*.hpp)
 
 clean: ## remove .venv, caches and results/
 	rm -rf $(VENV) results dist build docs/api docs/gallery
-	rm -rf .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage*
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # One environment for all targets, made afresh when what it is made from changes.

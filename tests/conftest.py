@@ -13,6 +13,7 @@ import typer.main
 import typer.testing
 from hypothesis import settings
 
+import compiled_lines
 import undertow as ut
 from undertow.cascade import CascadeState
 from undertow.law import Plan
@@ -26,8 +27,10 @@ settings.load_profile("undertow")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Let a run have so many minutes, for a part of the tests that a word draws."""
+    """Let a run have so many minutes, for a part of the tests that a word draws; count lines."""
     group = parser.getgroup("undertow")
+    count = "also run what is compiled in Python, where coverage sees its lines"
+    group.addoption("--count-compiled", action="store_true", help=count)
     group.addoption("--minutes", type=float, help="start no test later; its files in a drawn order")
     group.addoption("--draw", default="", help="a word that draws the order")
 
@@ -57,6 +60,8 @@ typer.testing._get_command = functools.cache(typer.main.get_command)  # type: ig
 
 def pytest_configure(config: pytest.Config) -> None:
     """Keep generated kernels in the checkout: workers share them, the user's cache stays clean."""
+    if config.getoption("count_compiled"):
+        compiled_lines.count_compiled()
     cache = getattr(config, "cache", None)  # absent with -p no:cacheprovider
     if cache is not None:
         os.environ.setdefault("UNDERTOW_CACHE", str(cache.mkdir("kernels")))

@@ -8,12 +8,12 @@ again with ``--seed N --only NUMBER``.
 Where it is known which test reaches which line, a mutant meets those tests first, and is over
 sooner::
 
-    pytest tests/law --cov=undertow --cov-context=test --cov-report=     # writes .coverage
+    make coverage                                     # writes .coverage
     python tests/mutants.py --package law --reached .coverage --near
 
-``--near`` leaves all others out, but for those that name a module of compiled lines, which coverage
-does not see: what survives then may yet be killed by another test.  The data are of the tests as
-they stand: one that is gone would count as one that fails.
+``--near`` leaves all others out, but for those that name a module of compiled lines, of which
+coverage sees some alone: what survives then may yet be killed by another test.  The data are of the
+tests as they stand: one that is gone would count as one that fails.
 """
 
 from __future__ import annotations
@@ -205,8 +205,8 @@ def _data(*files: str) -> tuple[coverage.CoverageData, ...]:
 def reaching(mutant: Mutant, files: tuple[str, ...]) -> list[str]:
     """Return the tests that reach the statement that was changed, the narrowest first.
 
-    Coverage sees neither compiled code nor the second use of a value that is remembered: a test
-    that is not among them may notice the mutant, too.
+    Coverage sees compiled code where it also ran in Python, and no second use of a value that is
+    remembered: a test that is not among them may notice the mutant, too.
     """
     nodes = ast.walk(ast.parse(mutant.file.read_bytes()))
     spans = [_span(node) for node in nodes if isinstance(node, ast.stmt)]

@@ -17,15 +17,69 @@ import undertow as ut
 from support import derivative, interpreted
 from undertow.base import InvalidInputError
 from undertow.closed_loop import Event
-from undertow.closed_loop.adaptive_integrator import LEAST
+from undertow.closed_loop.adaptive_integrator import BETWEEN, ERROR, LEAST, STAGES, WHEN
 from undertow.law import Plan
 from undertow.mechanisms import LIBRARY
+from undertow.models import FloatArray
 from undertow.objective import objective_for
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 
 #: One that swings by the target once before it settles there.
 PASSING = ut.Surface(-1, -3.688, 1.361, 9.052)
+
+
+#: A rooted tree, by the trees that grow from its root.
+Tree = tuple["Tree", ...]
+
+
+def forests(size: int, *, largest: int) -> list[Tree]:
+    """All sets of rooted trees with so many nodes together, none with more than ``largest``."""
+    if size == 0:
+        return [()]
+    return [
+        (first, *rest)
+        for nodes in range(min(size, largest), 0, -1)
+        for first in forests(nodes - 1, largest=nodes - 1)
+        for rest in forests(size - nodes, largest=nodes)
+        if not rest or nodes_of(rest[0]) < nodes or rest[0] <= first
+    ]
+
+
+def nodes_of(tree: Tree) -> int:
+    return 1 + sum(map(nodes_of, tree))
+
+
+def density(tree: Tree) -> int:
+    return nodes_of(tree) * math.prod(map(density, tree))
+
+
+def elementary(tree: Tree) -> FloatArray:
+    """What the stages make of the elementary differential of a tree, (7,)."""
+    A = np.hstack([STAGES, np.zeros((7, 1))])
+    return math.prod((A @ elementary(branch) for branch in tree), start=np.ones(7))
+
+
+def test_the_step_its_error_and_what_is_between_have_their_orders() -> None:
+    """Butcher's conditions, tree by tree: 5 for the step, 4 for its companion and the interpolant.
+
+    The error tells one order from the other; the interpolant has the slopes of its ends.
+    """
+    counts = [len(forests(nodes - 1, largest=nodes)) for nodes in range(1, 6)]
+    assert counts == [1, 1, 2, 4, 9]
+    step, errors = np.append(STAGES[-1], 0.0), []
+    for tree in (tree for nodes in range(5) for tree in forests(nodes, largest=nodes)):
+        weights, nodes = elementary(tree), nodes_of(tree)
+        assert step @ weights == pytest.approx(1 / density(tree), rel=1e-13)
+        errors.append((nodes, abs(float(ERROR @ weights))))
+        for part in (0.2, 0.5, 1.0) if nodes < 5 else ():
+            between = BETWEEN @ part ** np.arange(1, 5)
+            assert between @ weights == pytest.approx(part**nodes / density(tree), rel=1e-12)
+    assert max(error for nodes, error in errors if nodes < 5) < 1e-15
+    assert max(error for nodes, error in errors if nodes == 5) > 1e-5
+    np.testing.assert_allclose(elementary(((),)), WHEN, rtol=1e-14)
+    np.testing.assert_array_equal(BETWEEN[:, 0], np.eye(7)[0])
+    np.testing.assert_allclose(BETWEEN @ np.arange(1, 5), np.eye(7)[6], atol=1e-12)
 
 
 @pytest.fixture

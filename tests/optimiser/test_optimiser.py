@@ -86,6 +86,31 @@ def test_a_least_time_is_found_in_any_unit(rig: ut.Mechanism) -> None:
         assert found[2:] == pytest.approx(answers[0][2:], rel=1e-12)
 
 
+@pytest.mark.parametrize(
+    "freedom",
+    [ut.DecisionVariables(times=(0.0, 0.2)), ut.DecisionVariables(reaching=True, schedule=0.1)],
+    ids=["at given times", "at times that are found"],
+)
+def test_several_surfaces_cost_no_more_than_one(
+    optimisers: dict[str, ut.Optimiser], freedom: ut.DecisionVariables
+) -> None:
+    """One surface is several that are equal; they change when they may and cost what they claim."""
+    loop = optimisers["energy"].loop
+    x = loop.mechanism.state(phi=ut.deg(20))
+    one = ut.Optimiser(loop).propose(x, budget=ut.Budget(400))
+    several = ut.Optimiser(loop, freedom=freedom).propose(x, budget=ut.Budget(1600))
+    assert several.plan is not None
+    assert several.cost <= one.cost < math.inf
+    times = np.array(several.plan.times)
+    if freedom.schedule:
+        np.testing.assert_allclose(times / freedom.schedule, np.round(times / freedom.schedule))
+    else:
+        assert set(times) <= set(freedom.times)
+    true = loop.batch(x, several.plan, precise=True)
+    assert true.reached[0]
+    assert true.cost[0] == pytest.approx(several.cost, rel=0.2 * loop.tail_rtol)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "degrees", "radius"), [("time", 23, 0.3), ("energy", 20, 0.01)])
 def test_a_richer_set_of_variables_never_answers_worse(

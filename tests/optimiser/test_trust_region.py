@@ -10,7 +10,7 @@ from undertow.closed_loop import UNSTABLE
 from undertow.models import FloatArray
 from undertow.optimiser import CMAES
 from undertow.optimiser.cma_es import minimise
-from undertow.optimiser.trust_region import TrustRegion
+from undertow.optimiser.trust_region import TrustRegion, _shorten
 
 
 def _bowl(x: FloatArray) -> FloatArray:
@@ -31,6 +31,31 @@ def test_a_quadratic_takes_a_few_generations(d: int) -> None:
     search = TrustRegion(np.zeros(d), 0.1, 16, np.random.default_rng(0))
     minimise(search, _bowl, evaluations=400, tolerance=1e-12)
     assert search.best_f == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("d", [1, 2, 5])
+def test_a_step_is_newtons_within_the_region_and_leads_down_to_its_edge_beyond(d: int) -> None:
+    """Quadratics drawn at random, of either curvature, in parts of the region's radius."""
+    rng = np.random.default_rng(d)
+
+    def shortened(curvature: FloatArray, slope: FloatArray, reach: float) -> FloatArray:
+        step = np.full(d, np.nan)
+        _shorten(curvature, basis, basis.T @ slope, reach, step)
+        return step
+
+    for reach in (1e-3, 1.0, 50.0):
+        basis, _ = np.linalg.qr(rng.standard_normal((d, d)))
+        curvature, slope = np.sort(rng.uniform(0.5, 2.0, d)), rng.standard_normal(d)
+        newton = -np.linalg.solve(basis * curvature @ basis.T, slope)
+        within = slope / np.linalg.norm(newton)
+        step = shortened(curvature, within, reach)
+        np.testing.assert_allclose(step, reach * newton / np.linalg.norm(newton), rtol=1e-9)
+        for bent in (curvature, np.sort(rng.standard_normal(d))):
+            beyond = shortened(bent, 1e3 * within, reach)
+            assert np.linalg.norm(beyond) <= 1.5 * reach * (1 + 1e-12)
+            assert np.linalg.norm(beyond) >= 0.5 * reach
+            assert slope @ beyond < 0
+        assert not shortened(curvature, np.zeros(d), reach).any()
 
 
 def test_fewer_evaluations_than_a_covariance_takes() -> None:

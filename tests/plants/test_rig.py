@@ -29,6 +29,7 @@ from undertow.plants import (
     simulated,
     srv02_rig,
 )
+from undertow.plants.stepping import end_stops
 
 COULOMB, BREAKAWAY = 0.03, 0.04
 
@@ -147,6 +148,32 @@ def test_end_stops_hold_without_a_rebound() -> None:
     assert path[:, 0].max() == cart.coordinates[0].high
     assert path[-1, 2] == 0.0
     assert rig.stops_hit > 0
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_a_stop_takes_what_runs_into_it_by_an_impulse_there_and_nothing_else(n: int) -> None:
+    """M Δq̇ is of the joints outside alone, takes energy and never gives any; who turned back goes.
+
+    Inertia matrices are drawn at random, coupled.
+    """
+    rng = np.random.default_rng(n)
+    for _ in range(200):
+        root = rng.standard_normal((n, n))
+        inertia = root @ root.T + 0.1 * np.eye(n)
+        x = rng.uniform(-1.5, 1.5, 2 * n)
+        q, v = x[:n].copy(), x[n:].copy()
+        mobility = np.asarray(np.linalg.inv(inertia).ravel(), np.float64)
+        hits = end_stops(x, np.tile([-1.0, 1.0], (n, 1)), mobility)
+        outside, outward = np.abs(q) > 1.0, q * v > 0.0
+        np.testing.assert_array_equal(x[:n], np.clip(q, -1.0, 1.0))
+        impulse = inertia @ (x[n:] - v)
+        np.testing.assert_allclose(impulse[~outside], 0.0, atol=1e-10)
+        assert x[n:] @ inertia @ x[n:] <= v @ inertia @ v + 1e-10
+        if outside.sum() < 2:  # a second impact may set a joint going that has come to rest
+            assert hits == (outside & outward).sum()
+            assert not x[n:][outside & outward].any()
+        if not (outside & outward).any() and outside.sum() < 2:
+            np.testing.assert_array_equal(x[n:], v)
 
 
 def test_an_input_acts_after_its_delay_and_a_reading_has_its_age(arm: ut.Mechanism) -> None:

@@ -156,6 +156,38 @@ def test_a_policy_says_what_will_do(accept: tuple[Evidence, ...], x: FloatArray,
         assert verdict.margin > 0
 
 
+@pytest.mark.parametrize("kind", ["dual", "sampled"])
+def test_evidence_holds_up_to_the_margin_that_it_tells_and_no_further(kind: Evidence) -> None:
+    """The smallest det Γ/det Γ(0) on the way is what a policy may ask for at most."""
+    policy = GatePolicy((kind,))
+    least = assess(LOOP, Plan.of(GOOD), FAR, 20.0, policy).margin
+    for part, granted in ((1 - 1e-9, True), (1 + 1e-9, False)):
+        asks = replace(policy, singular_margin=part * least)
+        verdict = assess(LOOP, Plan.of(GOOD), FAR, 20.0, asks)
+        assert (verdict.kind == "sampled") is granted
+        assert granted or "singularity margin" in verdict.method
+
+
+@pytest.mark.parametrize(
+    ("surface", "horizon", "words"),
+    [
+        (UNSTABLE, 20.0, "unstable, margin"),
+        (GOOD, 0.1, "motion ends: horizon"),
+        (singular_at(0.2), 20.0, "motion ends: singular"),
+    ],
+)
+def test_local_evidence_is_a_motion_that_arrives_where_the_loop_is_stable(
+    surface: ut.Surface, horizon: float, words: str
+) -> None:
+    """Its margin is the slowest rate there; without either there is none, and it says why."""
+    policy = GatePolicy(("local",))
+    margin = float(ut.law.stability_margin(RIG, GOOD))
+    assert assess(LOOP, Plan.of(GOOD), FAR, 20.0, policy).margin == pytest.approx(margin)
+    verdict = assess(LOOP, Plan.of(surface), FAR, horizon, policy)
+    assert verdict.kind == "undecided"
+    assert words in verdict.method
+
+
 @pytest.mark.slow
 def test_margins_of_the_policy_count() -> None:
     """A singularity close to the path, a constraint, a hard input limit."""

@@ -9,6 +9,7 @@ import itertools
 import random
 from collections.abc import Callable
 from fractions import Fraction
+from functools import cache
 from typing import Any
 
 import mpmath
@@ -17,6 +18,7 @@ import pytest
 
 import undertow as ut
 from undertow.proofs.claims.model_data import law_of, model_of
+from undertow.proofs.kernel import compiled
 from undertow.proofs.kernel.bound import Goal, settle
 from undertow.proofs.kernel.compiled import between
 from undertow.proofs.kernel.graph import Graph, Node, Span, depends
@@ -141,6 +143,55 @@ def test_random_expressions_are_enclosed() -> None:
 @pytest.mark.slow
 def test_many_random_expressions_are_enclosed() -> None:
     assert enclosures(100_000, 1)[0] == 0
+
+
+#: The largest double, and ends of intervals from all over the range, unbounded ones among them.
+MOST = float(np.finfo(float).max)
+SIZES = (0.0, 5e-324, 1e-308, 1 / 3, 1.0, 1e6 + 1.0, 1e154, MOST, np.inf)
+ENDS = sorted({sign * size for sign in (-1.0, 1.0) for size in SIZES})
+
+
+def members(low: float, high: float) -> set[Fraction]:
+    """Numbers of an interval: its ends, the farthest doubles of an unbounded one, and 0."""
+    ends = {Fraction(min(max(end, -MOST), MOST)) for end in (low, high)}
+    return ends | ({Fraction(0)} if low <= 0 <= high else set())
+
+
+@pytest.mark.parametrize("kind", ["add", "sub", "mul", "div", "max", "min", "neg", "sqr", "abs"])
+def test_operations_hold_exact_results_up_to_the_ends_of_the_doubles(kind: str) -> None:
+    """Where they overflow, underflow and are unbounded; undefined is division by 0 and no other."""
+    op, f = getattr(compiled, kind.upper()), (TWO_OF | ONE_OF)[kind]
+    boxes = [(a, b) for a, b in itertools.combinations_with_replacement(ENDS, 2)
+             if (a, b) not in ((np.inf, np.inf), (-np.inf, -np.inf))]  # fmt: skip
+    pairs = list(itertools.product(boxes, boxes if kind in TWO_OF else [(1.0, 1.0)]))
+    for x, y in random.Random(0).sample(pairs, min(len(pairs), 4000)):
+        value = compiled.apply(op, complex(*x), complex(*y))
+        if kind == "div" and y[0] <= 0 <= y[1]:
+            assert np.isnan(value)
+            continue
+        sides = (members(*x), members(*y)) if kind in TWO_OF else (members(*x),)
+        for values in itertools.product(*sides):
+            assert value.real <= f(*values) <= value.imag, (x, y, values)
+
+
+@pytest.mark.parametrize("kind", ["sqrt", "sin", "cos", "exp", "log"])
+def test_functions_hold_their_values_up_to_the_ends_of_the_doubles(kind: str) -> None:
+    """At doubles, on the widest intervals and on halves of the line."""
+    op = getattr(compiled, kind.upper())
+    sizes = [*SIZES[:-1], np.pi / 2, np.pi, 40.0, 699.0, 701.0, 708.9, 709.5, 999999.0]
+    points = sorted({sign * size for sign in (-1.0, 1.0) for size in sizes})
+    with mpmath.workdps(400):
+        f = cache(lambda at: getattr(mpmath, kind)(mpmath.mpf(at)))
+        for low, high in itertools.combinations_with_replacement([*points, np.inf], 2):
+            if low == np.inf:  # no interval
+                continue
+            value = compiled.apply(op, complex(low, high), complex(low, high))
+            if kind in ("sqrt", "log") and not low > 0:
+                assert np.isnan(value)
+                continue
+            for at in (at for at in points if low <= at <= high):
+                assert value.real <= f(at) <= value.imag, (low, high, at)
+            assert kind not in ("sin", "cos") or (value.real >= -1 and value.imag <= 1)
 
 
 def smooth(rng: random.Random, graph: Graph) -> tuple[Node, Exact]:

@@ -22,9 +22,11 @@ from undertow.law import (
 from undertow.law.sliding import singularity
 from undertow.models import linearise
 from undertow.proofs import Verdict, hurwitz, nonsingular, reaching, singular_distance
+from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.exact_model import (
     exact_fraction,
 )
+from undertow.proofs.kernel.claims import Nonsingular, Reaching, decide
 
 RIG = ut.mechanisms.rotary_pendulum()
 BASE = ut.Surface(-1, -0.5, 5, 10)
@@ -178,14 +180,26 @@ def test_repeated_zero_eigenvalue_is_refuted() -> None:
 
 
 def test_a_surface_without_sliding_dynamics_is_refuted() -> None:
-    """Det E = 0 at the target: nothing to be stable."""
+    """Det E = 0 at the target: nothing to be stable, and no law of which anything is proved."""
     mechanism = linear_mechanism(2, 1, 3)
     # Exactly singular: α_u = α_a M_uu/M_au with powers of two.
     simple = ut.Mechanism(
         "simple", mechanism.coordinates, mechanism.inputs,
         sp.ImmutableDenseMatrix([[4, 1], [1, 2]]), mechanism.force,
     )  # fmt: skip
-    assert hurwitz(simple, ut.Surface(1, 1, 2, 1)).kind == "refuted"
+    none, other = ut.Surface(1, 1, 2, 1), ut.Surface(1, 1, 1, 1)
+    assert hurwitz(simple, none).kind == "refuted"
+    point = {"q0": (Fraction(0), Fraction(0))}
+    claims = (
+        Nonsingular(point, Fraction(1, 10)),
+        Reaching(point, (Fraction(0),) * 2, (Fraction(0),)),
+    )
+    model = model_of(simple)
+    for claim in claims:
+        assert decide(model, law_of(simple, other, ReachingLaw()), claim).kind == "proved"
+        found = decide(model, law_of(simple, none, ReachingLaw()), claim)
+        assert found.kind == "undecided"
+        assert "det Γ may be 0 at the target" in found.why
 
 
 # -- non-singularity -----------------------------------------------------------------------
