@@ -416,9 +416,14 @@ def test_only_exact_states_leave_it_to_later_decisions(
 def test_a_plan_that_is_late_on_a_plausible_plant_gives_way_to_one_close_by(
     pendulum: ut.Mechanism,
 ) -> None:
-    """It costs hardly more than that plan where nobody waits, and not what one in reserve does."""
+    """It costs hardly more than that plan where nobody waits, and not what one in reserve does.
+
+    So where states have errors.  With exact ones what is best for the estimate stays in use, as
+    long as it can be mended.
+    """
     objective, x = ut.MinimumEnergy(horizon=10.0), pendulum.state(phi=0.3)
-    made = ut.Cascade(pendulum, objective, belief=ut.Belief.relative(pendulum, **SPREAD))
+    belief = ut.Belief.relative(pendulum, **SPREAD)
+    made = ut.Cascade(pendulum, objective, belief=belief, covariance=1e-8 * np.eye(4))
     exact = ut.ClosedLoop(pendulum, objective)
     plan = ut.Optimiser(exact).propose(x, horizon=6.0).plan
     assert plan is not None
@@ -433,6 +438,29 @@ def test_a_plan_that_is_late_on_a_plausible_plant_gives_way_to_one_close_by(
     assert admission.accepted
     assert after.predicted == pytest.approx(whole.cost[0], rel=0.02)
     assert proposal.incumbent_cost > 1.2 * whole.cost[0]  # of the plan in reserve
+
+
+def test_what_is_best_for_the_estimate_is_in_use_while_it_can_be_mended(
+    pendulum: ut.Mechanism,
+) -> None:
+    """Of least energy, states exact: as long as one in reserve needs less than the time left."""
+    objective, x = ut.MinimumEnergy(horizon=10.0), pendulum.state(phi=0.3)
+    made = ut.Cascade(pendulum, objective, belief=ut.Belief.relative(pendulum, **SPREAD))
+    exact = ut.ClosedLoop(pendulum, objective)
+    hurried = made.loop.batch(x, list(made.reserve))
+    soonest = float(hurried.time[hurried.reached].min())
+    assert made.known is not None
+    for horizon, mendable in ((6.0, True), (1.1 * soonest, False)):
+        plan = ut.Optimiser(exact).propose(x, horizon=horizon).plan
+        assert plan is not None
+        left = 1.001 * float(exact.batch(x, plan).time[0])
+        assert not made.loop.batch(x, plan, duration=left).reached[0]
+        assert left > soonest
+        memory = CascadeState(plan, x=tuple(x.tolist()), estimate=made.known.prior)
+        proposal = made.propose(replace(memory, scale=1.0), x, 0.0, left)
+        after, _ = made.apply_gate(memory, proposal, x, left)
+        motion = made.loop.batch(x, after.plan, duration=left)
+        assert motion.reached[0] == (not mendable)
 
 
 def test_a_first_plan_looks_ahead_to_the_next_decision(pendulum: ut.Mechanism) -> None:

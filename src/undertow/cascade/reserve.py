@@ -15,8 +15,8 @@ from undertow.models import FloatArray
 #: target all are the same feedback, far from it each asks for more input before it saturates.
 STRONGER = (1.0, 2.0, 4.0, 8.0)
 
-#: Part of the time left within which a plan in reserve is to arrive where another than that is in
-#: use: what has to hurry in the end costs much more than what is planned a little sooner.
+#: Part of the time left in which a plan in reserve is to bring every plausible plant home, if
+#: another is in use: what has to hurry in the end costs much more than what is mended sooner.
 ROOM = 0.8
 
 
@@ -65,13 +65,14 @@ class Reserve:
         return self.plans[best - 1] if best else None
 
     def recovers(self, loop: ClosedLoop, error: FloatArray, span: float, plan: Plan) -> bool:
-        """Whether a plan brings every plausible plant home in time, or leaves room for another.
+        """Whether a plan may be in use as far as every plausible plant is concerned.
 
-        There is room as long as one of these, after a period of the plan, needs no more than
-        ``ROOM`` of the time that is left.
+        One of these, after a period of the plan, brings them home: where a smooth cost uses all the
+        time that there is, in ``ROOM`` of it; or the plan itself does.
         """
         then = [plan.followed_by(last, self.period, self.reaching) for last in self.plans]
+        left = None if loop.price_of_time > 0 else ROOM * span
         return bool(
-            loop.batch(error, then, duration=ROOM * span).reached.any()
+            loop.batch(error, then, duration=left).reached.any()
             or loop.batch(error, plan, duration=span).reached[0]
         )
