@@ -115,9 +115,7 @@ class Planning:
             if repairs and found is not None and isinstance(planner, Optimiser):
                 proposal = planner.repair(x, found, horizon=span)
             else:
-                proposal = planner.propose(
-                    x, incumbent=None, horizon=span, sequence=0, computed_for=t, resolution=0.0
-                )
+                proposal = self._from_nothing(planner, x, span, t)
             plan = proposal.plan
             if plan is None:
                 tries.append(Found(3, math.inf, proposal))
@@ -152,6 +150,20 @@ class Planning:
         if mends and best.rank < 3 and not (target is not None and target.moves):
             begun = replace(begun, ahead=self._ahead(begun, x, horizon))
         return begun, replace(proposal, sequence=number)
+
+    def _from_nothing(
+        self, planner: Planner, x: FloatArray, span: float | None, t: float
+    ) -> Proposal:
+        """Search for a plan from no other.
+
+        One of a smooth cost that the next decisions mend is in use for one period: what a search
+        for a single surface with the cascade's own reaching law takes is enough.
+        """
+        ask: dict[str, Any] = {"horizon": span, "computed_for": t}
+        if isinstance(planner, Optimiser) and self.planners.recourse and not planner.cold:
+            if planner.plainer is not None and not planner.counts_time:
+                ask["budget"] = planner.plainer.usual_cold
+        return planner.propose(x, incumbent=None, sequence=0, resolution=0.0, **ask)
 
     def _ahead(self, begun: CascadeState, x: FloatArray, span: float) -> Plan | None:
         """What will be best for the estimate at the next decision; ``None`` without any such plan.

@@ -14,7 +14,15 @@ from numpy.typing import ArrayLike
 
 from undertow.base import InvalidInputError, at_least, check_fields, checked
 from undertow.closed_loop import ClosedLoop
-from undertow.law import Plan, Surface, check_surface, first_surface, quadratic_designs
+from undertow.law import (
+    Plan,
+    ReachingLaw,
+    Surface,
+    check_surface,
+    first_surface,
+    quadratic_designs,
+    stability_margin,
+)
 from undertow.models import FloatArray
 from undertow.optimiser.proposal import Budget, Proposal, check_held
 from undertow.optimiser.search import (
@@ -32,6 +40,10 @@ from undertow.optimiser.task import Optimisation
 
 #: Quadratic designs that a global search begins with.
 DESIGNS = 31
+
+#: Rates at which a surface is reached gently, in multiples of the rate of its slowest sliding mode;
+#: and the boundary layer of such a law, in multiples of it, too: so wide that motions stay within.
+GENTLE, LINEAR = (1.0, 3.0, 10.0), 20.0
 
 
 class Planner(Protocol):
@@ -150,8 +162,21 @@ class Optimiser:
 
     @cached_property
     def firsts(self) -> FloatArray:
-        """Search coordinates of the designs, (N, d)."""
-        return np.vstack([self.space.encode(Plan.of(design)) for design in self.designs])
+        """Search coordinates of the designs, (N, d); the first one is the anchor's.
+
+        Where the reaching law is free and the cost smooth, each is reached gently, too: as a linear
+        feedback, at rates near those at which it slides.
+        """
+        plans = [Plan.of(design) for design in self.designs]
+        if self.freedom.reaching and not self.counts_time:
+            m, switching = self.loop.mechanism.m, self.loop.reaching.switching
+            for design in self.designs:
+                slides = float(stability_margin(self.loop.mechanism, design))
+                layer = LINEAR * slides
+                for rate in (faster * slides for faster in GENTLE):
+                    law = ReachingLaw((layer * rate,) * m, (layer,) * m, switching)
+                    plans.append(Plan((design,), (0.0,), (law,)))
+        return np.vstack([self.space.encode(plan) for plan in plans])
 
     def _budget(self, warm: bool) -> Budget:
         given = self.warm if warm else self.cold
