@@ -39,7 +39,7 @@ from undertow.proofs.search.chain import SearchBudget, _crossing, _expansion, _o
 from undertow.proofs.search.chart import natural_stretch, singular_distance_on_axis
 from undertow.proofs.search.linear_program import minimise_linear
 from undertow.proofs.search.quadratic import quadratic
-from undertow.proofs.search.region import LEAP, TIGHT, _proved_chain, _tight_level
+from undertow.proofs.search.region import HIGHEST, LEAP, TIGHT, _proved_chain, _tight_level
 from undertow.proofs.search.terminal_ellipsoid import EllipsoidSearch
 from vector_field import VectorField
 
@@ -400,8 +400,23 @@ def test_a_level_is_raised_to_within_two_per_cent_of_what_is_proved(edge: float)
     assert 1.0 <= level <= edge * (1 + 1e-9)
     refused = [a[-1] ** 2 for a in decide.asked if a[-1] ** 2 > edge * (1 + 1e-9)]
     assert min(refused) <= TIGHT * level * (1 + 1e-9)
+    assert refusal is not None
     assert refusal.kind == "undecided"
     assert len(decide.asked) < 20
+
+
+def test_a_level_that_is_never_refused_is_raised_no_further_than_the_highest() -> None:
+    """On a linear motion every level is proved: to raise it until one is refused never ended."""
+    asked: list[float] = []
+
+    def decide(chain: Sequence[LyapunovFunction]) -> Verdict:
+        asked.append(reach_of(chain[-1]) ** 2)
+        assert len(asked) < 20, f"levels {asked}"
+        return Verdict("told", "proved", method="told")
+
+    V, refusal = _tight_level([line(1.0)], decide)
+    assert refusal is None
+    assert max(asked) == pytest.approx(reach_of(V) ** 2) == pytest.approx(HIGHEST)
 
 
 # -- terminal ellipsoids ------------------------------------------------------------------------
