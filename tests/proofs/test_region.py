@@ -443,6 +443,9 @@ def test_a_file_says_all_and_false_claims_are_not_proved() -> None:
     proved = decide(model, law, claim, 20_000)
     assert proved.kind == "proved"
     assert "inputs not limited" in sentence(claim, model)
+    assert " with phi_dot = w_theta = 0, w = q_a + λ_a⁻¹ λ_u q_u," in sentence(claim, model)
+    moving = replace(claim, contains=(claim.contains[0], Fraction(1, 64), Fraction(-1, 128)))
+    assert "phi_dot = 0.015625, w_theta = -0.0078125, w =" in sentence(moving, model)
     first, second = claim.functions
     far = replace(claim, contains=(claim.contains[0] * 55, *claim.contains[1:]))
     assert decide(model, law, far, 20_000).kind == "refuted"
