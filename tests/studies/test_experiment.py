@@ -141,7 +141,9 @@ def test_progress_of_tasks_that_have_only_numbers_names_the_experiment() -> None
     """The noise of a coverage is a number, once 0: its progress read "… , 119 s left"."""
     tasks: dict[Key, Callable[[], float]] = {(noise, 0): lambda: 1.0 for noise in (0.001, 0.0)}
     told: list[tuple[str, float]] = []
-    work = Experiment("coverage", tuple[float, int, float], tasks, {}, lambda _: [])
+    work: Experiment[float, Any] = Experiment(
+        "coverage", tuple[float, int, float], tasks, {}, lambda _: []
+    )
     work.run(progress=lambda *words: told.append(words))
     assert told == [("coverage", 0.0), ("coverage", 0.5)]
 
