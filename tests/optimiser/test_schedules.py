@@ -211,6 +211,32 @@ def test_several_surfaces_are_nearer_to_the_bound_of_energy(d_e: float, degrees:
     assert all(len(a) >= len(b) for a, b in itertools.pairwise(later))
 
 
+def test_surfaces_that_can_lead_anywhere_follow_the_motion_to_the_target() -> None:
+    """Each moves the state along a straight line of its own: corners on the motion, end at home."""
+    rig, motion, period = ut.mechanisms.rotary_pendulum(), earliest("rotary_pendulum"), 0.1
+    arrival = EarliestArrival(rig, 0.01, *ut.MinimumTime().on(rig).range_of(rig))
+    rates = np.abs(motion.x).max(axis=0) / period
+
+    def states(x: FloatArray, z: FloatArray, time: float) -> FloatArray:
+        return np.asarray(x + time * rates * z)
+
+    follower = Follower(
+        lambda count, before: np.zeros((count, 2 * rig.n)), lambda x, qdd: np.zeros((1, 2 * rig.n)),
+        states, states, arrival, period, 0.002,
+    )  # fmt: skip
+    found = follower.follow(motion)
+    assert found is not None
+    z, times, end = found
+    assert np.diff(times).max() <= period + 1e-9
+    assert end / period == pytest.approx(round(end / period))
+    x, leads = motion.x[0], len({row.tobytes() for row in z})
+    for k in range(leads - 1):
+        x = states(x, z[k], times[k + 1] - times[k])
+        assert np.linalg.norm(x - arrival.state_at(motion, times[k + 1])) <= 0.5 * arrival.radius
+    last = [states(x, z[-1], t) for t in np.arange(0.002, end - times[leads - 1] + 1e-9, 0.002)]
+    assert np.linalg.norm(last, axis=1).min() < arrival.radius
+
+
 def test_where_all_motions_break_off_there_is_no_schedule() -> None:
     """And nothing is asked to be integrated exactly."""
     made = cascade("rotary_pendulum")
