@@ -77,6 +77,18 @@ def test_fewer_evaluations_than_a_covariance_takes() -> None:
     assert np.median(model) <= np.median(covariance)
 
 
+def test_until_something_is_admissible_it_looks_ever_nearer() -> None:
+    """A half ball, a hundredth as wide as the first samples; its face goes through the mean."""
+
+    def narrow(x: FloatArray) -> FloatArray:
+        inside = (np.linalg.norm(x, axis=1) < 1e-3) & (x[:, 0] > 0)
+        return np.where(inside, _bowl(x), np.inf)
+
+    search = TrustRegion(np.zeros(3), 0.1, 16, np.random.default_rng(0))
+    minimise(search, narrow, evaluations=400, tolerance=0.0)
+    assert search.best_f < np.inf
+
+
 def test_penalties_and_nan_stay_out_of_the_model() -> None:
     """A wall through the region leaves the best admissible candidate, and never a NaN."""
 
