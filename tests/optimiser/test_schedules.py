@@ -169,12 +169,15 @@ def test_a_surface_is_found_again_from_its_motion() -> None:
 
 
 def test_guesses_elsewhere_begin_at_the_same_state() -> None:
-    """The same path faster, and the other way round."""
-    motion = earliest("rotary_pendulum")
+    """The same path faster, with the velocities of that, and the other way round."""
+    motion, n = earliest("rotary_pendulum"), 2
     for guess in (motion.faster(), motion.mirrored()):
         assert np.allclose(guess.x[0], motion.x[0])
         assert guess.x.shape == motion.x.shape
-    assert motion.faster().time < motion.time
+    sooner = motion.faster()
+    assert sooner.time < motion.time
+    assert np.allclose(sooner.x[:, :n], motion.x[:, :n])
+    assert np.allclose(sooner.x[1:, n:] * sooner.time, motion.x[1:, n:] * motion.time)
     assert np.allclose(motion.mirrored().mirrored().x, motion.x)
 
 
