@@ -309,6 +309,9 @@ def test_a_set_grows_and_motions_come_back_through_all_that_is_new() -> None:
     assert 1.01 * extent(first, way) < extent(V, way) < 1
     new = np.linspace(extent(first, way), extent(V, way), 50)[:, None]
     assert (V(new + 1e-4 * motion(new)) < V(new)).all()
+    for far in (0.25 * way, 4.0 * way):  # a direction, however long
+        (W,) = grow(motion, first, far, 4, SearchBudget(1, INF), np.random.default_rng(0))
+        assert W.coefficients == pytest.approx(V.coefficients, rel=1e-6)
 
 
 @pytest.mark.slow
