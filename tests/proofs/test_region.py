@@ -241,7 +241,12 @@ def test_a_ring_inside_that_motions_cannot_cross_is_not_proved() -> None:
     inverse = np.array([[1.0, 1.0, 0], [0.05, 0, 0], [0, 0, 0.05]])
     V = LyapunovFunction(np.linalg.inv(inverse), SQUARES, np.ones(3))
     for chain in ([V], [V.times(1 / 0.29), V]):
-        assert verify_region(motion, chain, max_boxes=50_000).kind in ("refuted", "undecided")
+        verdict = verify_region(motion, chain, max_boxes=50_000)
+        assert verdict.kind == "refuted"
+        y = np.array([verdict.witness[name] for name in ("b", "b_dot", "w_a")])
+        assert V(y) <= 1
+        assert len(chain) == 1 or chain[0](y) > 1
+        assert V(y + 1e-6 * motion(y)) > V(y)
     assert verify_region(motion, [V.times(1 / 0.61), V], proved=1).kind == "proved"
 
 
