@@ -426,6 +426,28 @@ def test_models_of_thin_and_wide_boxes_hold_their_functions(width: float) -> Non
     assert (ends.imag - ends.real).max() < 1e-12 + 20 * width  # and hardly more
 
 
+def test_models_hold_functions_of_what_no_parabola_follows() -> None:
+    """All of a cube on [−1, 1] is error of its model: its square counts where slopes are zero."""
+    mpmath = pytest.importorskip("mpmath")
+    graph = Graph(1)
+    make, cube = graph.make, graph.power(graph.inputs[0], 3)
+    shifted = make("add", graph.number(2), cube)
+    nodes = [make("cos", cube), make("sin", cube), make("exp", cube), make("log", shifted),
+             make("sqrt", shifted), make("div", graph.number(1), shifted)]  # fmt: skip
+    f: list[Any] = [
+        mpmath.cos, mpmath.sin, mpmath.exp, lambda u: mpmath.log(2 + u),
+        lambda u: mpmath.sqrt(2 + u), lambda u: 1 / (2 + u),
+    ]  # fmt: skip
+    program = graph.program(nodes)
+    for wide in (0.1, 0.5, 1.0):
+        low, high = np.array([[-wide]]), np.array([[wide]])
+        found = ops.models(program.code, program.constants, program.outputs, low, high)
+        ends, _ = ops.ranges(found, 1)
+        for o, function in enumerate(f):
+            for x in np.linspace(-wide, wide, 21):
+                assert ends[0, o].real <= function(mpmath.mpf(x) ** 3) <= ends[0, o].imag
+
+
 def test_what_is_undefined_on_a_box_has_no_model() -> None:
     """1/0, √−1, log 0 and kinks prove nothing."""
     graph = Graph(1)
