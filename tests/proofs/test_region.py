@@ -266,6 +266,14 @@ def test_a_target_that_is_not_at_rest_and_different_stretches_are_not_proved(
         verify_region(MOTION, [])
 
 
+@pytest.mark.parametrize("ends", [(0.2, 0.1), (math.nan, 0.1), (0.1, math.inf)])
+def test_what_is_no_interval_of_a_parameter_is_refused(
+    ellipsoid: LyapunovFunction, ends: tuple[float, float]
+) -> None:
+    with pytest.raises(InvalidInputError, match=r"box of 'm'.*must be finite, low ≤ high"):
+        verify_region(MOTION, ellipsoid, parameters={"m": ends})
+
+
 def test_a_repeated_zero_eigenvalue_is_never_proved() -> None:
     """Without gravity or coupling q̈_u = 0: no search, and no function passes."""
     a, b = ut.Coordinate("a"), ut.Coordinate("b")
