@@ -20,6 +20,7 @@ from undertow.cascade.swing_up import (
     hanging,
 )
 from undertow.cascade.swing_up.attempts import unclipped
+from undertow.cascade.swing_up.law import periods
 from undertow.cascade.swing_up.search import (
     KEPT,
     SWINGS,
@@ -146,6 +147,11 @@ def test_turns_are_taken_off_freely_turning_joints_alone() -> None:
     region = CatchRegion(cart)
     offset = region.turns(np.array([7.0, 4 * math.pi + 0.1, 0.0, 0.0]))
     np.testing.assert_allclose(offset, [0.0, 4 * math.pi, 0.0, 0.0])
+    track, pole = cart.coordinates
+    endless = replace(cart, coordinates=(replace(track, low=-math.inf, high=math.inf), pole))
+    assert periods(endless).tolist() == [0.0, 2 * math.pi]
+    stopped = replace(cart, coordinates=(track, replace(pole, low=-1.0, high=1.0)))
+    assert periods(stopped).tolist() == [0.0, 0.0]
 
 
 def test_from_hanging_to_balanced_and_again_after_a_knock(
