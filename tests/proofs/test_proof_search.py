@@ -230,6 +230,24 @@ def test_the_pole_is_the_first_singular_angle() -> None:
     assert natural_stretch(SurfaceMotion(crane, ut.first_surface(crane))) is None
 
 
+def test_where_the_force_restores_no_longer_there_is_no_stretch() -> None:
+    """q̈ = −sin 3q does up to q = π/3: enough with a pole there, not with one further away."""
+
+    class Ending(VectorField):
+        mechanism, slow, end = RIG, np.ones((1, 1)), 1.0
+
+        def margin(self, z: ArrayLike) -> FloatArray:
+            return np.asarray(1 - np.abs(np.asarray(z)[..., 0]) / self.end)
+
+    q, v, w = sp.symbols("q v w", real=True)
+    motion: Any = Ending((q, v, w), (v, -sp.sin(3 * q), -w))
+    assert natural_stretch(motion) is not None
+    motion.end = 1.5
+    assert natural_stretch(motion) is None
+    repelled: Any = Ending((q, v, w), (v, q, -w))
+    assert natural_stretch(repelled) is None
+
+
 def test_stretched_coordinates_follow_the_conserved_energy() -> None:
     """½ μ q̇² + ∫ −F₀ μ dq of the undamped motion is near ½ (stiffness c₀² + c₁²) at η = 0."""
     S, pole = natural_stretch(MOTION, slow=True) or pytest.fail("no stretch")
@@ -309,6 +327,9 @@ def test_a_set_grows_and_motions_come_back_through_all_that_is_new() -> None:
     assert 1.01 * extent(first, way) < extent(V, way) < 1
     new = np.linspace(extent(first, way), extent(V, way), 50)[:, None]
     assert (V(new + 1e-4 * motion(new)) < V(new)).all()
+    for far in (0.25 * way, 4.0 * way):  # a direction, however long
+        (W,) = grow(motion, first, far, 4, SearchBudget(1, INF), np.random.default_rng(0))
+        assert W.coefficients == pytest.approx(V.coefficients, rel=1e-6)
 
 
 @pytest.mark.slow
