@@ -228,6 +228,14 @@ def _span(node: ast.stmt) -> tuple[int, int]:
     return node.lineno, max(node.lineno, body[0].lineno - 1) if body else node.end_lineno
 
 
+def _in_machine_code(mutant: Mutant) -> bool:
+    """Whether what was changed may be in what numba keeps: that is decorated, or a constant."""
+    nodes = ast.walk(ast.parse(mutant.file.read_bytes()))
+    functions = [node for node in nodes if isinstance(node, ast.FunctionDef)]
+    around = [f for f in functions if f.lineno <= mutant.line <= (f.end_lineno or 0)]
+    return not around or any(f.decorator_list for f in around)
+
+
 def _judge(words: list[str], environment: dict[str, str]) -> None:
     """Run tests in this process, and end with their exit status."""
     os.environ |= environment
@@ -254,15 +262,16 @@ def outcome(mutant: Mutant, reached: tuple[str, ...] = (), near: bool = False) -
             [*nearest(mutant, names), *(f"tests/{name}" for name in names)]
             for names in CORE[package]
         ]
+    stale = compiled and _in_machine_code(mutant)
     with tempfile.TemporaryDirectory(prefix="mutant-") as folder:
         tree = Path(folder) / "undertow"
         # What numba keeps of functions contains those that they call: none of it, if one changes.
         shutil.copytree(
-            PACKAGE, tree, ignore=shutil.ignore_patterns("*.nbi", "*.nbc") if compiled else None
+            PACKAGE, tree, ignore=shutil.ignore_patterns("*.nbi", "*.nbc") if stale else None
         )
         (tree / mutant.file.relative_to(PACKAGE)).write_bytes(mutant.text())
         # So it does of generated modules, but for what stands above all of those.
-        own = compiled and package not in ABOVE
+        own = stale and package not in ABOVE
         cache = Path(folder if own else tempfile.gettempdir()) / "mutants"
         environment = {"PYTHONPATH": folder, "UNDERTOW_CACHE": str(cache)}
         for tests in filter(None, turns):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 import undertow as ut
 from undertow.base import InvalidInputError
+from undertow.models import FloatArray
 
 RIG = ut.mechanisms.rotary_pendulum()
 GOAL = ut.objective_for(RIG, "effort", horizon=10.0)
@@ -63,6 +65,23 @@ def test_a_cascade_as_a_policy_decides_learns_and_balances(belief: Any) -> None:
     _, cost, event = play(ut.policy(cascade), ut.environment(RIG, GOAL), phi=0.3)
     assert event == "REACHED"
     assert cost < 1.1 * run.cost
+
+
+def test_a_policy_that_is_as_slow_as_decisions_decides_at_each_step() -> None:
+    asked: list[float] = []
+    cascade = ut.Cascade(
+        RIG, GOAL, belief="exact", period=0.008, cold=ut.Budget(512), warm=ut.Budget(64)
+    )
+
+    class Watch:
+        def propose(self, x: FloatArray, /, **rest: Any) -> ut.Proposal:
+            asked.append(rest["computed_for"])
+            return cascade.optimiser.propose(x, **rest)
+
+    act, state = ut.policy(replace(cascade, planner=Watch()), period=cascade.period), None
+    for _ in range(3):
+        _, state = act.predict(RIG.state(phi=0.1), state)
+    assert asked == pytest.approx([0.0, cascade.period, 2 * cascade.period])
 
 
 def test_a_cascade_as_a_policy_learns_the_plant_that_it_meets() -> None:

@@ -19,6 +19,8 @@ from undertow.cascade.swing_up import (
     designed,
     hanging,
 )
+from undertow.cascade.swing_up.attempts import unclipped
+from undertow.cascade.swing_up.law import periods
 from undertow.cascade.swing_up.search import (
     KEPT,
     SWINGS,
@@ -29,6 +31,7 @@ from undertow.cascade.swing_up.search import (
     search,
 )
 from undertow.estimators import Measured
+from undertow.models import linearise
 from undertow.plants import Bench, Push, RealisticRig, srv02_rig
 from undertow.proofs import terminal_sets
 from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
@@ -96,6 +99,18 @@ def test_the_catch_region_is_where_the_law_comes_home(
     assert wide.surface(arm.state(phi=ut.deg(35))) is None
 
 
+@pytest.mark.parametrize("name", ["rotary_pendulum", "cart_pendulum", "pendubot"])
+def test_the_regulator_of_the_catch_clips_nowhere_in_its_level_set(name: str) -> None:
+    """The most of |k x| on xᵀPx ≤ level is √(level · k P⁻¹ kᵀ): the limit; and it stabilises."""
+    mechanism = getattr(ut.mechanisms, name)()
+    P, level, k = unclipped(mechanism)
+    assert level * (k @ np.linalg.solve(P, k)) == pytest.approx(mechanism.input_limits[0] ** 2)
+    lin = linearise(mechanism)
+    closed = lin.A + lin.input @ k[None]
+    assert np.linalg.eigvalsh(closed.T @ P + P @ closed).max() < 0
+    assert np.linalg.eigvalsh(P).min() > 0
+
+
 def test_a_proved_set_catches_without_a_prediction(
     arm: ut.Mechanism, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -132,6 +147,11 @@ def test_turns_are_taken_off_freely_turning_joints_alone() -> None:
     region = CatchRegion(cart)
     offset = region.turns(np.array([7.0, 4 * math.pi + 0.1, 0.0, 0.0]))
     np.testing.assert_allclose(offset, [0.0, 4 * math.pi, 0.0, 0.0])
+    track, pole = cart.coordinates
+    endless = replace(cart, coordinates=(replace(track, low=-math.inf, high=math.inf), pole))
+    assert periods(endless).tolist() == [0.0, 2 * math.pi]
+    stopped = replace(cart, coordinates=(track, replace(pole, low=-1.0, high=1.0)))
+    assert periods(stopped).tolist() == [0.0, 0.0]
 
 
 def test_from_hanging_to_balanced_and_again_after_a_knock(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -10,8 +11,9 @@ import pytest
 
 import undertow as ut
 from undertow.base import InvalidInputError
-from undertow.cascade import CascadeState
+from undertow.cascade import Admission, CascadeState
 from undertow.cascade.simulation import legs_to, moments
+from undertow.closed_loop.along_reference import simulate_along
 from undertow.models import FloatArray
 
 CRANE = ut.mechanisms.overhead_crane()
@@ -203,13 +205,30 @@ def test_the_gate_sees_the_reference_move(cascade: ut.Cascade) -> None:
     state, proposal = cascade.start(CRANE.state(), reference)
     slow = ut.placed_surface(CRANE, [-0.2, -0.21, -0.22])
     other = replace(proposal, plan=ut.Plan.of(slow), sequence=1, computed_for=0.1)
-    from undertow.cascade import Admission
-
     yes = replace(cascade, gate=lambda *_: Admission(True, "yes", 1.0))
     _, admission = yes.apply_gate(state, other, CRANE.state())
     assert not admission.accepted
     assert "along the reference" in admission.reason
     assert np.isfinite(admission.cost)
+
+
+def test_a_refusal_tells_what_the_plan_in_use_costs_along_the_reference(
+    rig: ut.Mechanism, quick: ut.Surface
+) -> None:
+    """Not what the gate says of it about the target at rest."""
+    cascade = ut.Cascade(
+        rig, ut.objective_for(rig, "bench-energy"), belief="exact",
+        gate=lambda *_: Admission(False, "no", 1.0),
+    )  # fmt: skip
+    target = ut.Reference.sine(0.5, theta=0.3).legs(rig, 4.0)[0][1]
+    state, x = CascadeState(ut.Plan.of(quick), target=target), rig.state(phi=0.2)
+    unstable = ut.Plan.of(replace(quick, lambda_u=-quick.lambda_u))
+    answer = ut.Proposal(unstable, "converged", 0.0, math.inf, (), 0, 0.0, 1, 0.0)
+    after, admission = cascade.apply_gate(state, answer, x, 4.0)
+    assert not admission.accepted
+    assert after.plan == state.plan
+    motion = simulate_along(cascade.loop, x, state.plan, target, duration=4.0, start=0.0)
+    assert after.predicted == admission.cost == pytest.approx(motion.cost)
 
 
 def test_references_past_the_travel_are_refused(cascade: ut.Cascade) -> None:

@@ -365,6 +365,7 @@ def test_no_step_is_shorter_than_a_part_of_the_loops(rig: ut.Mechanism) -> None:
         (np.eye(3), "shape"),
         (-np.eye(4), "eigenvalue -1"),
         (np.triu(np.ones((4, 4))), "not symmetric"),
+        (np.eye(4) + 1e-4 * np.eye(4, k=1), "not symmetric"),
         (np.diag([1.0, 1.0, 1.0, math.nan]), "NaN"),
     ],
 )
@@ -375,7 +376,8 @@ def test_what_is_no_covariance_is_refused(
     for make in (ut.ClosedLoop, ut.Cascade):
         with pytest.raises(InvalidInputError, match=f"covariance.*{word}"):
             make(rig, covariance=covariance)
-    assert ut.ClosedLoop(rig, covariance=np.zeros((4, 4))).covariance is not None
+    for fine in (np.zeros((4, 4)), np.eye(4) + 1e-15 * np.eye(4, k=1)):  # rounded, as sums are
+        assert ut.ClosedLoop(rig, covariance=fine).covariance is not None
 
 
 @pytest.mark.parametrize(

@@ -169,12 +169,15 @@ def test_a_surface_is_found_again_from_its_motion() -> None:
 
 
 def test_guesses_elsewhere_begin_at_the_same_state() -> None:
-    """The same path faster, and the other way round."""
-    motion = earliest("rotary_pendulum")
+    """The same path faster, with the velocities of that, and the other way round."""
+    motion, n = earliest("rotary_pendulum"), 2
     for guess in (motion.faster(), motion.mirrored()):
         assert np.allclose(guess.x[0], motion.x[0])
         assert guess.x.shape == motion.x.shape
-    assert motion.faster().time < motion.time
+    sooner = motion.faster()
+    assert sooner.time < motion.time
+    assert np.allclose(sooner.x[:, :n], motion.x[:, :n])
+    assert np.allclose(sooner.x[1:, n:] * sooner.time, motion.x[1:, n:] * motion.time)
     assert np.allclose(motion.mirrored().mirrored().x, motion.x)
 
 
@@ -209,6 +212,37 @@ def test_several_surfaces_are_nearer_to_the_bound_of_energy(d_e: float, degrees:
     assert run.cost / least - 1.0 < wasted + 1e-3
     later = [update.plan.times for update in run.updates if update.t < plan.times[-1]]
     assert all(len(a) >= len(b) for a, b in itertools.pairwise(later))
+
+
+def test_surfaces_that_can_lead_anywhere_follow_the_motion_to_the_target() -> None:
+    """Each moves the state along a straight line of its own: corners on the motion, end at home.
+
+    From the start they break off after 0.08 s; all multiples of the period are corners even so.
+    """
+    rig, motion, period = ut.mechanisms.rotary_pendulum(), earliest("rotary_pendulum"), 0.1
+    arrival = EarliestArrival(rig, 0.01, *ut.MinimumTime().on(rig).range_of(rig))
+    rates = np.abs(motion.x).max(axis=0) / period
+
+    def states(x: FloatArray, z: FloatArray, time: float) -> FloatArray:
+        broken = time > 0.08 and np.array_equal(x, motion.x[0])
+        return np.full(z.shape, np.inf) if broken else np.asarray(x + time * rates * z)
+
+    follower = Follower(
+        lambda count, before: np.zeros((count, 2 * rig.n)), lambda x, qdd: np.zeros((1, 2 * rig.n)),
+        states, states, arrival, period, 0.002,
+    )  # fmt: skip
+    found = follower.follow(motion)
+    assert found is not None
+    z, times, end = found
+    assert end / period == pytest.approx(round(end / period))
+    multiples = period * np.arange(round(end / period))
+    assert np.abs(np.subtract.outer(multiples, times)).min(axis=1).max() < 1e-9
+    x, leads = motion.x[0], len({row.tobytes() for row in z})
+    for k in range(leads - 1):
+        x = states(x, z[k], times[k + 1] - times[k])
+        assert np.linalg.norm(x - arrival.state_at(motion, times[k + 1])) <= 0.5 * arrival.radius
+    last = [states(x, z[-1], t) for t in np.arange(0.002, end - times[leads - 1] + 1e-9, 0.002)]
+    assert np.linalg.norm(last, axis=1).min() < arrival.radius
 
 
 def test_where_all_motions_break_off_there_is_no_schedule() -> None:

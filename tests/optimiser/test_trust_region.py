@@ -10,7 +10,7 @@ from undertow.closed_loop import UNSTABLE
 from undertow.models import FloatArray
 from undertow.optimiser import CMAES
 from undertow.optimiser.cma_es import minimise
-from undertow.optimiser.trust_region import TrustRegion, _shorten
+from undertow.optimiser.trust_region import TrustRegion, _normal_equations, _shorten
 
 
 def _bowl(x: FloatArray) -> FloatArray:
@@ -75,6 +75,29 @@ def test_fewer_evaluations_than_a_covariance_takes() -> None:
     model = [spent(TrustRegion(np.ones(3), 0.1, 16, np.random.default_rng(s))) for s in seeds]
     covariance = [spent(CMAES(np.ones(3), 0.1, 16, np.random.default_rng(s))) for s in seeds]
     assert np.median(model) <= np.median(covariance)
+
+
+def test_whatever_is_far_away_counts_for_the_model_not_against_it() -> None:
+    """The equations are those of weighted least squares: positive definite at any distance."""
+    rng = np.random.default_rng(0)
+    x, terms = rng.standard_normal((40, 2)), 6
+    f, away, near = _bowl(x), np.linalg.norm(x, axis=1), np.arange(40)
+    for reach in (10.0, 1.0, 0.1, 0.01):
+        normal, right = np.zeros((terms, terms)), np.zeros(terms)
+        _normal_equations(x, f, np.zeros(2), 1.0, away, near, reach, normal, right)
+        assert np.linalg.eigvalsh(normal).min() > 0
+
+
+def test_until_something_is_admissible_it_looks_ever_nearer() -> None:
+    """A half ball, a hundredth as wide as the first samples; its face goes through the mean."""
+
+    def narrow(x: FloatArray) -> FloatArray:
+        inside = (np.linalg.norm(x, axis=1) < 1e-3) & (x[:, 0] > 0)
+        return np.where(inside, _bowl(x), np.inf)
+
+    search = TrustRegion(np.zeros(3), 0.1, 16, np.random.default_rng(0))
+    minimise(search, narrow, evaluations=400, tolerance=0.0)
+    assert search.best_f < np.inf
 
 
 def test_penalties_and_nan_stay_out_of_the_model() -> None:

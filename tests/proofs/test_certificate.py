@@ -38,7 +38,7 @@ from undertow.proofs.claims.reaching import ReachingClaim, reaching
 from undertow.proofs.claims.region import RegionClaim, reaches, verify_region
 from undertow.proofs.claims.stability import hurwitz
 from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
-from undertow.proofs.claims.verify import match, proved_sets, verify
+from undertow.proofs.claims.verify import check_settings, match, proved_sets, verify
 from undertow.proofs.claims.written import number_text
 from undertow.proofs.gate import GatePolicy, assess
 from undertow.proofs.kernel import claims as kernel
@@ -215,6 +215,16 @@ def test_another_model_is_refused(written: bytes) -> None:
     assert checked[0].verdict
     certified = match(certificate, heavier)
     assert {p.name: p.value for p in certified.parameters}["m"] == 0.125
+
+
+def test_settings_are_those_that_the_proof_is_about(written: bytes) -> None:
+    """Of another value, with the one that was proved; of a name that it does not have."""
+    certificate = Certificate.from_bytes(written)
+    check_settings(certificate, certificate.parameters)
+    with pytest.raises(CertificateError, match=r"'m'.*got 0\.13.*must be 0\.125, as proved"):
+        check_settings(certificate, {"m": 0.13})
+    with pytest.raises(CertificateError, match=r"'bananas'.*must be one of the certificate's"):
+        check_settings(certificate, {"bananas": 1.0})
 
 
 def test_a_parameter_changed_and_signed_again_meets_the_proof(written: bytes) -> None:

@@ -19,6 +19,7 @@ from undertow.proofs.claims.certificate import Certificate
 from undertow.proofs.claims.closed_loop import LoopClaim
 from undertow.proofs.claims.document import document_bytes
 from undertow.proofs.claims.model_data import law_of, model_of
+from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid as Ellipsoid
 from undertow.proofs.claims.verify import proved_sets, verify
 from undertow.proofs.claims.words import sentence
 from undertow.proofs.claims.written import claim_data
@@ -34,7 +35,7 @@ from undertow.proofs.kernel.graph import Graph, Program
 from undertow.proofs.kernel.loop import ContinuousLoop
 from undertow.proofs.kernel.model import System
 from undertow.proofs.kernel.reader import Refused, read
-from undertow.proofs.search.closed_loop import _largest_box, _Task, prove_loop
+from undertow.proofs.search.closed_loop import _largest_box, _Task, _terminal, prove_loop
 from undertow.proofs.search.terminal_ellipsoid import search_for
 from undertow.studies.certification import loop_figure
 from undertow.studies.paper.appendix import CASES
@@ -222,6 +223,30 @@ def test_a_box_that_is_lost_is_made_thinner_whatever_the_reach() -> None:
     crane = ut.mechanisms.overhead_crane()
     found = prove_loop(crane, ut.first_surface(crane), starts={"theta": 1.0}, seconds=12)
     assert found.verdict.margin > 0.04
+
+
+class Balls:
+    """Proves the balls of the state space that are no larger than one."""
+
+    def __init__(self, largest: float) -> None:
+        self.largest = largest
+
+    def around(self, state: FloatArray) -> Ellipsoid | None:
+        size, one = float(np.linalg.norm(state)), np.eye(len(state))
+        return Ellipsoid(one, one, size) if size <= self.largest else None
+
+
+def test_the_terminal_set_is_one_that_the_motions_enter() -> None:
+    """Of eight that shrink alike, from ever farther starts; the farthest breaks off."""
+    sizes, fall = np.linspace(0.1, 0.8, 8), 0.9 ** np.arange(60)
+    path = fall[:, None, None] * sizes[:, None] * np.array([0.5, -0.5, 0.5, 0.5])
+    path[20:, -1] = np.nan
+    found = _terminal(Balls(0.2), path)  # type: ignore[arg-type]
+    assert found is not None
+    assert found.radius <= 0.2
+    for motion in path[:, :-1].swapaxes(0, 1):
+        assert any(found.contains(x) for x in motion)
+    assert _terminal(Balls(0.0), path) is None  # type: ignore[arg-type]
 
 
 class Thin:

@@ -39,7 +39,7 @@ from undertow.proofs.search.chain import SearchBudget, _crossing, _expansion, _o
 from undertow.proofs.search.chart import natural_stretch, singular_distance_on_axis
 from undertow.proofs.search.linear_program import minimise_linear
 from undertow.proofs.search.quadratic import quadratic
-from undertow.proofs.search.region import LEAP, TIGHT, _proved_chain, _tight_level
+from undertow.proofs.search.region import HIGHEST, LEAP, TIGHT, _proved_chain, _tight_level
 from undertow.proofs.search.terminal_ellipsoid import EllipsoidSearch
 from vector_field import VectorField
 
@@ -230,6 +230,24 @@ def test_the_pole_is_the_first_singular_angle() -> None:
     assert natural_stretch(SurfaceMotion(crane, ut.first_surface(crane))) is None
 
 
+def test_where_the_force_restores_no_longer_there_is_no_stretch() -> None:
+    """q̈ = −sin 3q does up to q = π/3: enough with a pole there, not with one further away."""
+
+    class Ending(VectorField):
+        mechanism, slow, end = RIG, np.ones((1, 1)), 1.0
+
+        def margin(self, z: ArrayLike) -> FloatArray:
+            return np.asarray(1 - np.abs(np.asarray(z)[..., 0]) / self.end)
+
+    q, v, w = sp.symbols("q v w", real=True)
+    motion: Any = Ending((q, v, w), (v, -sp.sin(3 * q), -w))
+    assert natural_stretch(motion) is not None
+    motion.end = 1.5
+    assert natural_stretch(motion) is None
+    repelled: Any = Ending((q, v, w), (v, q, -w))
+    assert natural_stretch(repelled) is None
+
+
 def test_stretched_coordinates_follow_the_conserved_energy() -> None:
     """½ μ q̇² + ∫ −F₀ μ dq of the undamped motion is near ½ (stiffness c₀² + c₁²) at η = 0."""
     S, pole = natural_stretch(MOTION, slow=True) or pytest.fail("no stretch")
@@ -309,6 +327,9 @@ def test_a_set_grows_and_motions_come_back_through_all_that_is_new() -> None:
     assert 1.01 * extent(first, way) < extent(V, way) < 1
     new = np.linspace(extent(first, way), extent(V, way), 50)[:, None]
     assert (V(new + 1e-4 * motion(new)) < V(new)).all()
+    for far in (0.25 * way, 4.0 * way):  # a direction, however long
+        (W,) = grow(motion, first, far, 4, SearchBudget(1, INF), np.random.default_rng(0))
+        assert W.coefficients == pytest.approx(V.coefficients, rel=1e-6)
 
 
 @pytest.mark.slow
@@ -400,8 +421,23 @@ def test_a_level_is_raised_to_within_two_per_cent_of_what_is_proved(edge: float)
     assert 1.0 <= level <= edge * (1 + 1e-9)
     refused = [a[-1] ** 2 for a in decide.asked if a[-1] ** 2 > edge * (1 + 1e-9)]
     assert min(refused) <= TIGHT * level * (1 + 1e-9)
+    assert refusal is not None
     assert refusal.kind == "undecided"
     assert len(decide.asked) < 20
+
+
+def test_a_level_that_is_never_refused_is_raised_no_further_than_the_highest() -> None:
+    """On a linear motion every level is proved: to raise it until one is refused never ended."""
+    asked: list[float] = []
+
+    def decide(chain: Sequence[LyapunovFunction]) -> Verdict:
+        asked.append(reach_of(chain[-1]) ** 2)
+        assert len(asked) < 20, f"levels {asked}"
+        return Verdict("told", "proved", method="told")
+
+    V, refusal = _tight_level([line(1.0)], decide)
+    assert refusal is None
+    assert max(asked) == pytest.approx(reach_of(V) ** 2) == pytest.approx(HIGHEST)
 
 
 # -- terminal ellipsoids ------------------------------------------------------------------------

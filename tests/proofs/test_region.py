@@ -241,7 +241,12 @@ def test_a_ring_inside_that_motions_cannot_cross_is_not_proved() -> None:
     inverse = np.array([[1.0, 1.0, 0], [0.05, 0, 0], [0, 0, 0.05]])
     V = LyapunovFunction(np.linalg.inv(inverse), SQUARES, np.ones(3))
     for chain in ([V], [V.times(1 / 0.29), V]):
-        assert verify_region(motion, chain, max_boxes=50_000).kind in ("refuted", "undecided")
+        verdict = verify_region(motion, chain, max_boxes=50_000)
+        assert verdict.kind == "refuted"
+        y = np.array([verdict.witness[name] for name in ("b", "b_dot", "w_a")])
+        assert V(y) <= 1
+        assert len(chain) == 1 or chain[0](y) > 1
+        assert V(y + 1e-6 * motion(y)) > V(y)
     assert verify_region(motion, [V.times(1 / 0.61), V], proved=1).kind == "proved"
 
 
@@ -259,6 +264,14 @@ def test_a_target_that_is_not_at_rest_and_different_stretches_are_not_proved(
     assert "different stretches" in verdict.method
     with pytest.raises(InvalidInputError, match="empty"):
         verify_region(MOTION, [])
+
+
+@pytest.mark.parametrize("ends", [(0.2, 0.1), (math.nan, 0.1), (0.1, math.inf)])
+def test_what_is_no_interval_of_a_parameter_is_refused(
+    ellipsoid: LyapunovFunction, ends: tuple[float, float]
+) -> None:
+    with pytest.raises(InvalidInputError, match=r"box of 'm'.*must be finite, low ≤ high"):
+        verify_region(MOTION, ellipsoid, parameters={"m": ends})
 
 
 def test_a_repeated_zero_eigenvalue_is_never_proved() -> None:
@@ -421,6 +434,28 @@ def test_models_of_thin_and_wide_boxes_hold_their_functions(width: float) -> Non
     assert (ends.imag - ends.real).max() < 1e-12 + 20 * width  # and hardly more
 
 
+def test_models_hold_functions_of_what_no_parabola_follows() -> None:
+    """All of a cube on [−1, 1] is error of its model: its square counts where slopes are zero."""
+    mpmath = pytest.importorskip("mpmath")
+    graph = Graph(1)
+    make, cube = graph.make, graph.power(graph.inputs[0], 3)
+    shifted = make("add", graph.number(2), cube)
+    nodes = [make("cos", cube), make("sin", cube), make("exp", cube), make("log", shifted),
+             make("sqrt", shifted), make("div", graph.number(1), shifted)]  # fmt: skip
+    f: list[Any] = [
+        mpmath.cos, mpmath.sin, mpmath.exp, lambda u: mpmath.log(2 + u),
+        lambda u: mpmath.sqrt(2 + u), lambda u: 1 / (2 + u),
+    ]  # fmt: skip
+    program = graph.program(nodes)
+    for wide in (0.1, 0.5, 1.0):
+        low, high = np.array([[-wide]]), np.array([[wide]])
+        found = ops.models(program.code, program.constants, program.outputs, low, high)
+        ends, _ = ops.ranges(found, 1)
+        for o, function in enumerate(f):
+            for x in np.linspace(-wide, wide, 21):
+                assert ends[0, o].real <= function(mpmath.mpf(x) ** 3) <= ends[0, o].imag
+
+
 def test_what_is_undefined_on_a_box_has_no_model() -> None:
     """1/0, √−1, log 0 and kinks prove nothing."""
     graph = Graph(1)
@@ -443,6 +478,9 @@ def test_a_file_says_all_and_false_claims_are_not_proved() -> None:
     proved = decide(model, law, claim, 20_000)
     assert proved.kind == "proved"
     assert "inputs not limited" in sentence(claim, model)
+    assert " with phi_dot = w_theta = 0, w = q_a + λ_a⁻¹ λ_u q_u," in sentence(claim, model)
+    moving = replace(claim, contains=(claim.contains[0], Fraction(1, 64), Fraction(-1, 128)))
+    assert "phi_dot = 0.015625, w_theta = -0.0078125, w =" in sentence(moving, model)
     first, second = claim.functions
     far = replace(claim, contains=(claim.contains[0] * 55, *claim.contains[1:]))
     assert decide(model, law, far, 20_000).kind == "refuted"

@@ -189,6 +189,7 @@ def test_a_surface_without_sliding_dynamics_is_refuted() -> None:
     )  # fmt: skip
     none, other = ut.Surface(1, 1, 2, 1), ut.Surface(1, 1, 1, 1)
     assert hurwitz(simple, none).kind == "refuted"
+    assert hurwitz(simple, none).margin < 0
     point = {"q0": (Fraction(0), Fraction(0))}
     claims = (
         Nonsingular(point, Fraction(1, 10)),

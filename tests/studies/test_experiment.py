@@ -137,6 +137,17 @@ def test_an_interrupted_experiment_goes_on_where_it_ended(tmp_path: Path) -> Non
         other.ledger(tmp_path)
 
 
+def test_progress_of_tasks_that_have_only_numbers_names_the_experiment() -> None:
+    """The noise of a coverage is a number, once 0: its progress read "… , 119 s left"."""
+    tasks: dict[Key, Callable[[], float]] = {(noise, 0): lambda: 1.0 for noise in (0.001, 0.0)}
+    told: list[tuple[str, float]] = []
+    work: Experiment[float, Any] = Experiment(
+        "coverage", tuple[float, int, float], tasks, {}, lambda _: []
+    )
+    work.run(progress=lambda *words: told.append(words))
+    assert told == [("coverage", 0.0), ("coverage", 0.5)]
+
+
 def test_what_was_finished_before_a_task_failed_is_kept(tmp_path: Path) -> None:
     work = squares(9, [])
     ledger = work.ledger(tmp_path)

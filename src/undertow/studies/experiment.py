@@ -145,7 +145,7 @@ class Experiment(Generic[V, R]):
         def missing() -> Iterator[tuple[Key, tuple[Callable[[], V]]]]:
             for key, task in self.tasks.items():
                 if key not in book.known:
-                    words = [str(part) for part in key if part and not isinstance(part, int)]
+                    words = [part for part in key if part and isinstance(part, str)] or [self.name]
                     progress(", ".join(words), len(self.finished(book)) / len(self.tasks))
                     yield key, (task,)
 

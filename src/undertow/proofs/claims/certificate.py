@@ -81,8 +81,8 @@ class Certificate:
 
     name: str
     subjects: tuple[Subject, ...]
-    content: bytes = field(default=b"", repr=False)
-    _document: Document | None = field(default=None, repr=False, compare=False)
+    content: bytes = b""
+    _document: Document | None = field(default=None, compare=False)
 
     def __repr__(self) -> str:
         """Show whose it is and how many claims it has."""

@@ -185,10 +185,13 @@ def _(claim: kernel.SurfaceRegion, model: Model) -> str:
     away = {k: v for k, v in zip(names, claim.contains, strict=True) if v}
     exact = len(away) > 1  # with one entry the point may be rounded towards 0
     points = [f"{k} = {exactly(v) if exact else inward(v, 6)}" for k, v in away.items()]
+    others = "".join(f"{k} = " for k in names if k not in away)
+    rest = f" with {others}0" if others else ""
+    where = f"{', '.join(points)}{rest}, w = q_a + λ_a⁻¹ λ_u q_u," if points else "it"
     ranges = "".join(f", for every {k} in {within(*ends)}" for k, ends in claim.plant.items())
     return (
         "every motion on the surface from a compact set around the target that contains "
-        f"{', '.join(points) or 'it'} converges to the target{ranges}, non-singular all the "
-        f"way, in the union of {len(claim.functions)} such sets; the plant else the model, no "
+        f"{where} converges to the target{ranges}, non-singular all the way, in the "
+        f"union of {len(claim.functions)} such sets; the plant else the model, no "
         "other force, the inputs not limited"
     )

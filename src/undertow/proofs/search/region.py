@@ -30,6 +30,8 @@ Chain = tuple[LyapunovFunction, ...]
 
 #: How close to the largest level that the checker proves; the first step on the way there.
 TIGHT, STRIDE = 1.02, 1.05
+#: The largest level that is tried: on a linear motion none is ever refused.
+HIGHEST = 100.0
 
 #: Boxes of each function's proof.
 MOST_BOXES = 1_000_000
@@ -57,7 +59,7 @@ class ProvedRegion:
         How far along the asked direction the set is proved to reach.
     raised
         What the checker says of the last level, at most 2 % higher: never ``proved``, and
-        with a witness.
+        with a witness.  ``None`` where no level up to 100 was refused.
     """
 
     motion: SurfaceMotion
@@ -65,7 +67,7 @@ class ProvedRegion:
     chain: Chain
     verdict: Verdict
     extent: float
-    raised: Verdict
+    raised: Verdict | None
 
     @property
     def function(self) -> LyapunovFunction:
@@ -211,16 +213,19 @@ def _proved_chain(firsts: Chain, found: Chain, decide: Decide) -> list[LyapunovF
 
 def _tight_level(
     chain: Sequence[LyapunovFunction], decide: Decide
-) -> tuple[LyapunovFunction, Verdict]:
-    """The last function with a level that is proved and, 2 % higher, is not: and that verdict."""
+) -> tuple[LyapunovFunction, Verdict | None]:
+    """The last function with a level that is proved and, 2 % higher, is not: and that verdict.
+
+    Without a verdict where all levels up to the largest that is tried are proved.
+    """
     *inner, V = chain
     stride = STRIDE
     level, low, high, refusal = stride, 1.0, math.inf, None
-    while refusal is None or high / low > TIGHT:
+    while low < HIGHEST and high / low > TIGHT:
         verdict = decide([*inner, V.times(1 / level)])
         if verdict:
             low, stride = level, stride**2
         else:
             high, refusal = level, verdict
-        level = low * stride if refusal is None else math.sqrt(low * high)
+        level = min(low * stride, HIGHEST) if refusal is None else math.sqrt(low * high)
     return V.times(1 / low), refusal
