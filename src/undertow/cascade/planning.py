@@ -115,7 +115,9 @@ class Planning:
             if repairs and found is not None and isinstance(planner, Optimiser):
                 proposal = planner.repair(x, found, horizon=span)
             else:
-                proposal = self._from_nothing(planner, x, span, t)
+                proposal = planner.propose(
+                    x, incumbent=None, horizon=span, sequence=0, computed_for=t, resolution=0.0
+                )
             plan = proposal.plan
             if plan is None:
                 tries.append(Found(3, math.inf, proposal))
@@ -151,20 +153,6 @@ class Planning:
             begun = replace(begun, ahead=self._ahead(begun, x, horizon))
         return begun, replace(proposal, sequence=number)
 
-    def _from_nothing(
-        self, planner: Planner, x: FloatArray, span: float | None, t: float
-    ) -> Proposal:
-        """Search for a plan from no other.
-
-        One of a smooth cost that the next decisions mend is in use for one period: what a search
-        for a single surface with the cascade's own reaching law takes is enough.
-        """
-        ask: dict[str, Any] = {"horizon": span, "computed_for": t}
-        if isinstance(planner, Optimiser) and self.planners.recourse and not planner.cold:
-            if planner.plainer is not None and not planner.counts_time:
-                ask["budget"] = planner.plainer.usual_cold
-        return planner.propose(x, incumbent=None, sequence=0, resolution=0.0, **ask)
-
     def _ahead(self, begun: CascadeState, x: FloatArray, span: float) -> Plan | None:
         """What will be best for the estimate at the next decision; ``None`` without any such plan.
 
@@ -184,8 +172,8 @@ class Planning:
         """What the first plan is to be best on, one after the other.
 
         Before anything has moved, what suits every plausible plant suits none of them well: the
-        estimate alone comes first, for a plan that the next decision replaces; a schedule for it
-        without any error before.  Where its plan does not do what it promised, small steps
+        estimate alone comes first, for a plan that the next decision replaces; a schedule, and a
+        smooth cost with a free reaching law, for it without any error before.  Where its plan does not do what it promised, small steps
         throughout follow: for one plant, which is integrated to the tolerance, smaller ones than
         usual.  With many plants and a smooth cost that plan is repaired first: what costs least
         goes up to a bound, and small steps may find it broken by a hair.
@@ -198,7 +186,10 @@ class Planning:
         loops = [whole]
         if belief is not None and estimate is not None:
             loops.insert(0, whole.believing(whole.mechanism, belief.alone(estimate)))
-        if planners.recourse and planners.optimiser.freedom.schedule:
+        free = planners.optimiser.freedom
+        if planners.recourse and (
+            free.schedule or (free.reaching and not planners.optimiser.counts_time)
+        ):
             loops.insert(0, predictions.estimated(estimate))
 
         def smaller(loop: ClosedLoop) -> ClosedLoop:
