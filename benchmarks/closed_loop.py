@@ -124,7 +124,7 @@ def cascade(
     scene: Scene,
     plant: ut.Mechanism,
     objective: ut.Objective,
-    freedom: ut.DecisionVariables | None,
+    freedom: ut.DecisionVariables,
     now: Clock,
     belief: Literal["usual", "exact"] = "exact",
 ) -> Result:
@@ -192,7 +192,9 @@ def controllers(
         "do-mpc 10 Hz, energy": lambda: predictive(DoMPC(scene.rig, "energy", now=now)),
         "cascade, time": lambda: cascade(scene, plant, time, ut.DecisionVariables(), now),
         "cascade, time, reaching free": lambda: cascade(scene, plant, time, free, now),
-        "belief, energy": lambda: cascade(scene, plant, energy, None, now, "usual"),
+        "belief, energy": lambda: cascade(
+            scene, plant, energy, ut.DecisionVariables(), now, "usual"
+        ),
         "belief, time": lambda: cascade(scene, plant, time, ut.DecisionVariables(), now, "usual"),
         "belief, time, reaching free": lambda: cascade(scene, plant, time, free, now, "usual"),
         "belief, time, schedule": lambda: cascade(scene, plant, time, schedule, now, "usual"),

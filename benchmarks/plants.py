@@ -8,10 +8,10 @@ one.  States are exact; every controller meets the same plants and knows the mod
 
 *kept* is the optimum for the model from the start, small errors of state and surface allowed for,
 kept to the end; *exact* the cascade that takes its model for the plant; *belief* the cascade with a
-belief: an ensemble of what is plausible, learnt as it goes, every 20 ms; *three* the same that
-chooses the three parameters of a surface, *free* one that chooses the reaching law, too, as
-*belief* does for energy and not for time; *schedule* one that chooses surfaces with reaching laws,
-each for 0.05 s.  Their law acts continuously, or with ``--hold`` is sampled, its input held.
+belief: an ensemble of what is plausible, learnt as it goes, every 20 ms; *free* the same that may
+choose the reaching law, too; *schedule* one that chooses surfaces with reaching laws, each for
+0.05 s.  Their law acts continuously,
+or with ``--hold`` is sampled, its input held.
 
 *lqr* is clipped linear-quadratic feedback, continuous too, the best on the model of 39 weights,
 by hindsight.  *predictive* plans anew a hundred times a second and holds its input in between: for
@@ -78,14 +78,13 @@ LARGER = {
 }
 OBJECTIVES = {"energy": ut.MinimumEnergy(horizon=10.0), "time": ut.MinimumTime(horizon=6.0)}
 RADIUS = 0.01
-#: What cascades with a belief may choose; ``None``: what is usual.
+#: What cascades with a belief may choose.
 FREEDOMS = {
-    "belief": None,
-    "three": ut.DecisionVariables(),
+    "belief": ut.DecisionVariables(),
     "free": ut.DecisionVariables(reaching=True),
     "schedule": ut.DecisionVariables(reaching=True, schedule=0.05),
 }
-OURS = ("kept", "exact", "belief", "three", "free", "schedule")
+OURS = ("kept", "exact", "belief", "free", "schedule")
 PEERS = ("lqr", "predictive", "learnt", "scenario")
 CONTROLLERS = (*OURS, *PEERS, "acados")
 #: Longest step of a loop whose input is held, s: the library's usual one.

@@ -85,9 +85,9 @@ class Cascade:
         (0: continuous), as for :class:`undertow.ClosedLoop`.
     freedom
         What may be chosen besides the paper's surface parameters: reaching gains, a
-        schedule of surfaces.  Times of a schedule are multiples of the period.  By default the
-        reaching gains of a smooth cost, which they bring near each plant's bound, and nothing for
-        least time, or where the belief is exact: see :attr:`variables`.
+        schedule of surfaces.  Times of a schedule are multiples of the period.  With reaching gains
+        a smooth cost comes near the bound of each plant, by laws so gentle that friction which
+        nobody estimates may keep them from arriving.
     cold, warm
         Budgets of the first optimisation and of the later ones; by default as the method
         needs.
@@ -152,7 +152,7 @@ class Cascade:
     first: Surface | None = None
     step: float = 0.002
     zoh_steps: int = 0
-    freedom: DecisionVariables | None = None
+    freedom: DecisionVariables = DecisionVariables()
     cold: Budget | None = None
     warm: Budget | None = None
     resolution: float = 1e-4
@@ -195,19 +195,19 @@ class Cascade:
                 limit=f"a whole multiple of the inner step, {stride:g} s, up to {longest:g} s",
                 remedy="Change the period, or the step",
             )
-        if any(abs(t / self.period - round(t / self.period)) > 1e-6 for t in self.variables.times):
+        if any(abs(t / self.period - round(t / self.period)) > 1e-6 for t in self.freedom.times):
             raise InvalidInputError(
                 "times of a schedule",
-                value=self.variables.times,
+                value=self.freedom.times,
                 limit=f"multiples of the period, {self.period:g} s",
                 remedy="Then what is left of a plan is a plan again",
             )
-        parts = self.period / (self.variables.schedule or self.period)
+        parts = self.period / (self.freedom.schedule or self.period)
         whole = max(parts, 1 / parts)
         if abs(whole - round(whole)) > 1e-6:
             raise InvalidInputError(
                 "schedule of the cascade",
-                value=f"{self.variables.schedule:g} s",
+                value=f"{self.freedom.schedule:g} s",
                 limit=f"a multiple or a whole part of the period, {self.period:g} s",
                 remedy="Then what is left of a plan is a plan again",
             )
@@ -238,19 +238,6 @@ class Cascade:
         return known if isinstance(known, Belief) and known.tolerances else None
 
     @cached_property
-    def variables(self) -> DecisionVariables:
-        """What is chosen: ``freedom``, or what is usual.
-
-        Gains that are free bring a smooth cost near each plant's bound as the plant is learnt;
-        what arrives first asks for gains that only an exact model bears, and estimated states
-        bear less.
-        """
-        if self.freedom is not None:
-            return self.freedom
-        exact_states, smooth = self.covariance is None, not self.loop.price_of_time
-        return DecisionVariables(reaching=self.known is not None and exact_states and smooth)
-
-    @cached_property
     def loop(self) -> ClosedLoop:
         """The predicted closed loop, belief as plant, integrated to its end: the gate's."""
         belief, objective = self.known, self.objective
@@ -275,7 +262,7 @@ class Cascade:
         anew as the plant is learnt.  But such plans do not bear errors of the state, so single
         surfaces have recourse where states are exact; schedules have it for least time alone.
         """
-        scheduled = self.variables.schedule > 0
+        scheduled = self.freedom.schedule > 0
         bears = self.loop.price_of_time > 0 if scheduled else self.covariance is None
         return self.known is not None and self.planner is None and bears
 
@@ -289,11 +276,11 @@ class Cascade:
     @cached_property
     def optimiser(self) -> Optimiser:
         """The optimiser of the outer loop; its rollouts end in the exact linear tail."""
-        single = self.recourse and self.variables.schedule > 0
+        single = self.recourse and self.freedom.schedule > 0
         loop = self.predictions.estimated(None) if single else self.loop
         return Optimiser(
-            searched(loop, self.variables),
-            self.first, self.cold, self.warm, self.variables, seed=self.seed,
+            searched(loop, self.freedom),
+            self.first, self.cold, self.warm, self.freedom, seed=self.seed,
         )  # fmt: skip
 
     @cached_property

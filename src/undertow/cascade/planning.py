@@ -173,10 +173,11 @@ class Planning:
 
         Before anything has moved, what suits every plausible plant suits none of them well: the
         estimate alone comes first, for a plan that the next decision replaces; a schedule, and a
-        smooth cost with a free reaching law, for it without any error before.  Where its plan does not do what it promised, small steps
-        throughout follow: for one plant, which is integrated to the tolerance, smaller ones than
-        usual.  With many plants and a smooth cost that plan is repaired first: what costs least
-        goes up to a bound, and small steps may find it broken by a hair.
+        smooth cost with a free reaching law, for it without any error before.  Where its plan does
+        not do what it promised, small steps throughout follow: for one plant, which is integrated
+        to the tolerance, smaller ones than usual.  With many plants and a smooth cost that plan is
+        repaired first: what costs least goes up to a bound, and small steps may find it broken by a
+        hair.
         """
         planners, predictions = self.planners, self.predictions
         belief = predictions.belief
@@ -187,9 +188,8 @@ class Planning:
         if belief is not None and estimate is not None:
             loops.insert(0, whole.believing(whole.mechanism, belief.alone(estimate)))
         free = planners.optimiser.freedom
-        if planners.recourse and (
-            free.schedule or (free.reaching and not planners.optimiser.counts_time)
-        ):
+        gently = free.reaching and not planners.optimiser.counts_time
+        if planners.recourse and (free.schedule or gently):
             loops.insert(0, predictions.estimated(estimate))
 
         def smaller(loop: ClosedLoop) -> ClosedLoop:

@@ -120,7 +120,7 @@ def simulate(
     if steering == "cascade":
         gate = default_gate() if accept is None else _evidence_gate(accept)
         known = known or ("exact" if accept or schedule else "usual")
-        freedom = DecisionVariables(reaching=True, schedule=schedule) if schedule else None
+        freedom = DecisionVariables(reaching=schedule > 0, schedule=schedule)
         cascade = Cascade(
             belief, goal, period=period, gate=gate, seed=seed, belief=known, freedom=freedom
         )
