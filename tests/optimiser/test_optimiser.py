@@ -452,3 +452,28 @@ def test_what_suits_every_plant_is_found_near_what_is_best_for_one() -> None:
     first = next(cascade.optimiser.improve(start))
     assert first.plan is not None
     assert cascade.loop.batch(start, first.plan).reached[0]
+
+
+def test_a_gentle_start_is_a_linear_feedback(rig: ut.Mechanism) -> None:
+    """Where nothing saturates the closed loop decays as its surface slides, and as s does."""
+    free = ut.DecisionVariables(reaching=True)
+    loop = ut.ClosedLoop(rig, OBJECTIVES["energy"])
+    optimiser = ut.Optimiser(loop, freedom=free)
+    designs = len(optimiser.designs)
+    gentle = optimiser.firsts[designs:]
+    assert len(gentle) == 3 * designs
+    timed = ut.Optimiser(ut.ClosedLoop(rig, ut.MinimumTime()), freedom=free)
+    assert len(timed.firsts) == designs  # what arrives first is not gentle
+    for z in gentle[:6]:
+        plan = optimiser.space.plan(z)
+        ((eta,), (layer,)) = plan.laws(loop.reaching)[0].per_surface(1)
+        law = ut.SlidingModeLaw(rig, plan.surfaces[0], plan.laws(loop.reaching)[0])
+
+        def rate(x: NDArray[np.float64], law: ut.SlidingModeLaw = law) -> NDArray[np.float64]:
+            return np.concatenate([x[2:], rig.accelerations(0.0, x, law(0.0, x).u)])
+
+        h = 1e-5
+        A = np.column_stack([(rate(h * e) - rate(-h * e)) / (2 * h) for e in np.eye(4)])
+        slides = np.linalg.eigvals(ut.law.sliding_matrix(rig, plan.surfaces[0]))
+        modes = np.append(slides, -eta / layer)
+        assert np.poly(A) == pytest.approx(np.poly(modes), rel=1e-4, abs=1e-3)
