@@ -195,6 +195,7 @@ def controllers(
         "belief, energy": lambda: cascade(
             scene, plant, energy, ut.DecisionVariables(), now, "usual"
         ),
+        "belief, energy, reaching free": lambda: cascade(scene, plant, energy, free, now, "usual"),
         "belief, time": lambda: cascade(scene, plant, time, ut.DecisionVariables(), now, "usual"),
         "belief, time, reaching free": lambda: cascade(scene, plant, time, free, now, "usual"),
         "belief, time, schedule": lambda: cascade(scene, plant, time, schedule, now, "usual"),
