@@ -219,10 +219,29 @@ def test_what_has_fallen_says_so_and_is_caught_again(simulation: Simulation) -> 
     assert states[-1]["why"]
     assert [m for m in said if m["kind"] == "frame"][-1]["u"] == [0.0]
     assert abs(simulation.rig.truth[1]) < 2 * math.pi + 0.1  # turns are taken off
-    simulation.rig = simulation._rig(RIG.state(phi=0.1))
+    # Upright, but on its way through: 0.1 rad, and 4 rad/s that carry it beyond what is caught.
+    simulation.rig = simulation._rig(RIG.state(phi=0.1, phi_dot=4.0))
+    simulation._step()
+    assert simulation.mode == "fallen"
+    # Three turns of the arm are none.
+    simulation.rig = simulation._rig(RIG.state(theta=6 * math.pi + 0.2, phi=0.1))
     go(simulation, 2.0)
     assert simulation.mode == "running"
-    assert abs(simulation.rig.truth[1]) < 0.05
+    assert np.abs(simulation.rig.truth[:2]).max() < 0.25
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["reaction_wheel_pendulum", "wheeled_inverted_pendulum"])
+def test_a_turn_of_a_wheel_on_the_ground_is_a_way(name: str) -> None:
+    """Turns are taken off where they are none to see: of a flywheel, and not of a rolling one."""
+    mechanism = getattr(ut.mechanisms, name)()
+    worker = InlineWorker(planner(mechanism), latency=0.0)
+    simulation = Simulation(mechanism, sketch(mechanism), worker=worker)
+    simulation.rig = simulation._rig(np.array([20.0, 0.5, 0.0, 0.0]))
+    simulation._unwind()
+    rolls = name == "wheeled_inverted_pendulum"
+    assert simulation.rig.truth[0] == pytest.approx(20.0 if rolls else 20.0 - 6 * math.pi)
+    simulation.close()
 
 
 @pytest.mark.slow

@@ -92,6 +92,10 @@ class Scene:
         """Return x and y of all points, the tip last, then angles and radii of discs, (K,), m."""
         return np.array(self._places(*q, *parameters), dtype=float)
 
+    def points(self, q: FloatArray, parameters: FloatArray) -> FloatArray:
+        """Return all points, the tip last, (count, 2), m."""
+        return self.places(q, parameters)[: 2 * self.count].reshape(-1, 2)
+
     def slopes(self, q: FloatArray, parameters: FloatArray, grip: Grip) -> FloatArray:
         """Return ∂p/∂q of a place that is held, (2, n)."""
         every = np.array(self._slopes(*q, *parameters), dtype=float).reshape(-1, 2, self._n)
@@ -99,7 +103,7 @@ class Scene:
 
     def held(self, q: FloatArray, parameters: FloatArray, grip: Grip) -> FloatArray:
         """Return where a place that is held is in the picture, (2,), m."""
-        every = self.places(q, parameters)[: 2 * self.count].reshape(-1, 2)
+        every = self.points(q, parameters)
         return np.asarray((1.0 - grip.part) * every[grip.a] + grip.part * every[grip.b])
 
     def nearest(
@@ -109,7 +113,7 @@ class Scene:
 
         ``None`` where all are farther away than ``reach``, m.
         """
-        every = self.places(q, parameters)[: 2 * self.count].reshape(-1, 2)
+        every = self.points(q, parameters)
         here, best, least = np.asarray(at, dtype=float), None, reach
         for a, b in self._segments:
             way = every[b] - every[a]

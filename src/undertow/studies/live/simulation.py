@@ -58,8 +58,9 @@ PUSHED, PUSHED_PART = {"rad": 0.7, "m": 0.2}, 0.5
 #: An answer is looked for once a picture: so much later than its time it is not late, s.
 PICTURE = 1.0 / 60.0
 
-#: A mechanism that has fallen is caught when its free angles are so near again, rad, and as slow.
-CATCH, SLOW = 0.45, 5.0
+#: A mechanism that has fallen is caught when its free angles are so near again, rad, with where
+#: their velocities carry them in the time of the fastest mode.
+CATCH = 0.35
 
 #: Least time from asking for a plan to its use, s.
 LEAST_LEAD = 0.01
@@ -149,7 +150,12 @@ class Simulation:
         cascade.objective.check_start(mechanism, self._x0)
         self._belief = Belief.usual(mechanism)
         far = float(np.abs(self._x0[: mechanism.n]).max())
-        carried = PUSHED_PART * mechanism.linearise().fastest * far
+        self._fastest = mechanism.linearise().fastest
+        self._turning = [
+            i for i, one in enumerate(mechanism.coordinates)
+            if one.unit == "rad" and (i >= mechanism.m or math.isinf(one.high - one.low))
+        ]  # fmt: skip
+        carried = PUSHED_PART * self._fastest * far
         self._usual_push = min(PUSHED[mechanism.coordinates[-1].unit], carried or math.inf)
         self._settings = Settings()
         surface = first_surface(mechanism)
@@ -302,18 +308,37 @@ class Simulation:
         return False
 
     def _is_near(self, error: FloatArray) -> bool:
-        n, free = self.mechanism.n, self._free_angles()
-        near = all(abs(error[i]) < CATCH and abs(error[n + i]) < SLOW for i in free)
-        return near and bool(self.law.margin[0] > 0.2) and bool(np.isfinite(error).all())
+        n = self.mechanism.n
+        q, v = (np.abs(error[half][self._free_angles()]) for half in (slice(n), slice(n, None)))
+        return (
+            bool((q + v / max(self._fastest, 1e-9) < CATCH).all())
+            and bool(self.law.margin[0] > 0.2)
+            and bool(np.isfinite(error).all())
+        )
 
     def _unwind(self) -> None:
-        """Count a free angle that has turned over from the nearest upright."""
+        """Count angles that have turned over from the nearest upright, or from the target.
+
+        A driven angle is left alone where a turn of it is something else, as that of a wheel on
+        the ground or of a joint with a spring.
+        """
         x = self.rig.truth
-        turns = {i: round(x[i] / (2 * math.pi)) for i in self._free_angles()}
-        if any(turns.values()):
-            for i, count in turns.items():
-                x[i] -= 2 * math.pi * count
+        for i in self._turning:
+            turned = x.copy()
+            turned[i] -= 2 * math.pi * round((x[i] - self._goal[i]) / (2 * math.pi))
+            if turned[i] == x[i] or (i < self.mechanism.m and not self._same(x, turned)):
+                continue
+            x = turned
             self.rig = self._rig(x)
+
+    def _same(self, x: FloatArray, other: FloatArray) -> bool:
+        """Whether two states look alike, and move alike."""
+        force, n = self.mechanism.f, self.mechanism.n
+        a, b = (
+            np.concatenate([self.scene.points(y[:n], self._parameters).ravel(), force(y)])
+            for y in (x, other)
+        )
+        return bool(np.allclose(a, b, rtol=1e-6, atol=1e-9))
 
     def _spend(self, error: FloatArray, u: FloatArray) -> None:
         word = self._task.objective
