@@ -263,6 +263,7 @@ class Simulation:
             u = np.zeros(self.mechanism.m)
             self.law(error)
             if self._is_near(error):
+                self._unwind()
                 self.mode, self._anew, self._why = RUNNING, True, ""
         held = bool(self.hands)
         if held:
