@@ -127,11 +127,16 @@ def cascade(
     freedom: ut.DecisionVariables,
     now: Clock,
     belief: Literal["usual", "exact"] = "exact",
+    rubs: bool = False,
 ) -> Result:
-    """Run undertow's cascade; also return the seconds of each optimisation."""
-    controller = ut.Cascade(scene.rig, objective, freedom=freedom, belief=belief)
+    """Run undertow's cascade; also return the seconds of each optimisation.
+
+    Where it ``rubs``, its model has friction of at most half as much again as the scene's.
+    """
+    model = scene.rig.with_friction(**{scene.joint: 1.5 * scene.friction}) if rubs else scene.rig
+    controller = ut.Cascade(model, objective, freedom=freedom, belief=belief)
     seconds: list[float] = []
-    for incumbent in (None, ut.first_surface(scene.rig)):  # compile
+    for incumbent in (None, ut.first_surface(model)):  # compile
         controller.optimiser.propose(scene.x0, incumbent=incumbent, budget=ut.Budget(64))
     if belief == "exact":
         controller = replace(controller, planner=Timed(controller.optimiser, now, seconds))
@@ -196,6 +201,9 @@ def controllers(
             scene, plant, energy, ut.DecisionVariables(), now, "usual"
         ),
         "belief, energy, reaching free": lambda: cascade(scene, plant, energy, free, now, "usual"),
+        "belief of friction, energy": lambda: cascade(
+            scene, plant, energy, ut.DecisionVariables(), now, "usual", rubs=True
+        ),
         "belief, time": lambda: cascade(scene, plant, time, ut.DecisionVariables(), now, "usual"),
         "belief, time, reaching free": lambda: cascade(scene, plant, time, free, now, "usual"),
         "belief, time, schedule": lambda: cascade(scene, plant, time, schedule, now, "usual"),

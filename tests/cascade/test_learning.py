@@ -463,6 +463,40 @@ def test_what_is_best_for_the_estimate_is_in_use_while_it_can_be_mended(
         assert motion.reached[0] == (not mendable)
 
 
+def rubbing(pendulum: ut.Mechanism, friction: float) -> ut.Mechanism:
+    """Return a plant with Coulomb friction of the motor's axis, N m, that nobody tells of."""
+    theta_dot = pendulum.coordinates[0].velocity
+    return pendulum.disturbed({"theta": -friction * sp.tanh(theta_dot / 0.05)})
+
+
+def test_what_is_not_explained_asks_for_room(pendulum: ut.Mechanism) -> None:
+    """Where friction stops what should have moved, a plan is to be home before the time is up."""
+    objective, x = ut.MinimumEnergy(horizon=10.0), pendulum.state(theta=0.1)
+    made = ut.Cascade(pendulum, objective, belief=ut.Belief.relative(pendulum, **SPREAD))
+    memory, _ = made.start(x)
+    loops = [
+        ut.ClosedLoop(pendulum, objective, plant=plant)
+        for plant in (pendulum, rubbing(pendulum, 0.03))
+    ]
+    ends = [loop.simulate(x, memory.plan, duration=0.1).x[-1] for loop in loops]
+    soon = [made._judge.soon(memory, end, 0.1, 9.9) for end in ends]
+    assert soon[0] == 9.9
+    part = np.linalg.norm((ends[1] - ends[0])[:2]) / np.linalg.norm((ends[0] - x)[:2])
+    assert part > 0.1
+    assert soon[1] == pytest.approx(9.9 / (1 + 5 * (part - 0.03)), rel=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reaching", [False, True])
+def test_friction_that_nobody_tells_of_is_borne(reaching: bool) -> None:
+    """Of least energy a plan takes all the time that there is: it must leave some for friction."""
+    rig = ut.mechanisms.rotary_pendulum(d_e=0.025)
+    free = ut.DecisionVariables(reaching=reaching)
+    for plant in (changed(rig, {"m": 0.2}), changed(rig, {"m": -0.15})):
+        cascade = ut.Cascade(rig, ut.MinimumEnergy(horizon=60.0), freedom=free, belief="usual")
+        assert cascade.simulate(rig.state(phi=ut.deg(41)), plant=rubbing(plant, 0.02)).reached
+
+
 def test_a_first_plan_looks_ahead_to_the_next_decision(pendulum: ut.Mechanism) -> None:
     """It suits all plants and stays if nothing is decided; the next decision begins with more."""
     made = replace(scheduled(pendulum), freedom=ut.DecisionVariables())

@@ -24,6 +24,10 @@ from undertow.optimiser import Proposal
 #: that jumps shows in positions at once; what a model does not know shows in velocities first.
 JUMP, PART = 0.1, 0.5
 
+#: What part of a motion may be left unexplained, as one is whose parameters are being learnt; and
+#: how much sooner a plan to be mended is to be home where all of it is.
+UNEXPLAINED, SOONER = 0.03, 5.0
+
 
 class Judge:
     """Decides on plans, with a cascade's gate and what every plausible plant asks for.
@@ -53,8 +57,9 @@ class Judge:
         self._bounds_input = predictions.belief is not None and guarded
 
     def standing(
-        self, state: CascadeState, loop: ClosedLoop, plan: Plan, error: FloatArray, span: float
-    ) -> Plan:
+        self, state: CascadeState, loop: ClosedLoop, plan: Plan, error: FloatArray, span: float,
+        soon: float,
+    ) -> Plan:  # fmt: skip
         """The plan in use, or where it does not suit every plausible plant the best in reserve.
 
         A plan with which a joint sticks suits none.  One that is to be mended need not suit all.
@@ -62,7 +67,7 @@ class Judge:
         if loop.ensemble is None:
             return plan
         sticks = self._sticks(state, loop, plan) > 0
-        if not sticks and self.mendable(state, loop, plan, error, span):
+        if not sticks and self.mendable(state, loop, plan, error, soon):
             return plan
         better = self.reserve.better(loop, plan, error, span, sticks)
         return plan if better is None else better
@@ -76,6 +81,23 @@ class Judge:
         estimated = self.predictions.estimated_at(state)
         arrives = estimated.batch(error, plan, duration=span, precise=True).reached[0]
         return bool(arrives) and self.reserve.recovers(loop, error, span, plan)
+
+    def soon(self, state: CascadeState, error: FloatArray, t: float, span: float) -> float:
+        """The time in which a plan to be mended is to be home, of the time ``span`` left, s.
+
+        What no parameter of the model explains, as friction that it does not have, makes a motion
+        late: the farther positions are off where the estimate says that the plan in use moved them
+        since the last decision, beside that way, the more room a plan leaves.
+        """
+        loop, past = self.predictions.estimated_at(state), t - state.since
+        known = bool(state.x) and 0.0 < past <= self.objective.horizon
+        if not self.recourse or loop.price_of_time > 0 or not known:
+            return span
+        n, start = loop.mechanism.n, np.array(state.x)
+        motion = loop.batch(start, state.plan, duration=past, terminal=0.0, precise=True)
+        off, way = (np.linalg.norm(d[:n]) for d in (error - motion.x[0], motion.x[0] - start))
+        rest = float(off / way) if math.isfinite(off) and way > 0.0 else 0.0
+        return span / (1.0 + SOONER * max(0.0, rest - UNEXPLAINED))
 
     def breaks(
         self, state: CascadeState, plans: list[Plan], error: FloatArray, span: float
@@ -133,13 +155,13 @@ class Judge:
         t = proposal.computed_for
         jump = self._jump(state, t, error)
         loop = self.predictions.at(state, t)
-        used = state.at(t)
-        old = self.standing(replace(state, since=t), loop, used, error, span)
+        used, soon = state.at(t), self.soon(state, error, t, span)
+        old = self.standing(replace(state, since=t), loop, used, error, span, soon)
         state = replace(
             state, plan=old, since=t, sequence=proposal.sequence, x=as_numbers(error), ahead=None
         )
         mends, mended = (
-            plan is not None and self.mendable(state, loop, plan, error, span)
+            plan is not None and self.mendable(state, loop, plan, error, soon)
             for plan in (old, proposal.plan)
         )
         judge = self.predictions.estimated_at(state) if mends or mended else loop

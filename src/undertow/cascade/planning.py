@@ -226,8 +226,8 @@ class Planning:
             error = state.error(t, predictions.prior.mechanism.check_state(x))
             span = judge.objective.horizon if horizon is None else horizon
             here, loop, used = replace(state, since=t), predictions.at(state, t), state.at(t)
+            soon = judge.soon(state, error, t, span)
             ask: dict[str, Any] = {
-                "horizon": horizon,
                 "sequence": sequence,
                 "computed_for": t,
                 "resolution": self.resolution * state.scale,
@@ -238,7 +238,8 @@ class Planning:
             if planners.recourse and (timed or not first):
                 estimated = predictions.estimated(state.estimate)
                 optimiser = planners.optimiser_of(estimated, state.target, t)
-                admits = partial(judge.reserve.recovers, loop, error, span)
+                admits = partial(judge.reserve.recovers, loop, error, soon)
+                until = soon if soon < span else horizon
                 spent = (t - state.since) * loop.price_of_time
                 promised = 0.0 if first else state.predicted - spent
                 begins = [(used, promised)]
@@ -251,18 +252,28 @@ class Planning:
                 for asked in (admits,) if scheduled else (None, admits):
                     for plan, cost in begins if not mended else ():
                         found = optimiser.propose(
-                            error, incumbent=plan, admits=asked, promised=cost, **ask
+                            error,
+                            incumbent=plan,
+                            admits=asked,
+                            promised=cost,
+                            horizon=until,
+                            **ask,
                         )
                         answers.append(found)
-                        if found.plan and judge.mendable(here, loop, found.plan, error, span):
+                        if found.plan and judge.mendable(here, loop, found.plan, error, soon):
                             mended.append(found)
-                if mended or judge.mendable(here, loop, used, error, span):
+                if mended or judge.mendable(here, loop, used, error, soon):
                     return _best_of(mended or answers[:1], answers)
             planner = planners.of(predictions.plausible(state.estimate), state.target, t)
-            standing = judge.standing(here, loop, used, error, span)
-            near = [planner.propose(error, incumbent=standing, **ask)]
-            if standing is not used:  # what suits all may be near what is late on one of them
-                near.append(planner.propose(error, incumbent=used, **ask))
+            standing = judge.standing(here, loop, used, error, span, soon)
+            # What suits all may be near what is late on one of them.
+            begin = [standing] if standing is used else [standing, used]
+            near: list[Proposal] = []
+            for until in (soon, horizon) if soon < span else (horizon,):
+                for plan in begin:
+                    near.append(planner.propose(error, incumbent=plan, horizon=until, **ask))
+                if until == horizon or any(found.plan for found in near):
+                    break
             return _best_of(near, near)
         except Exception as error:  # the inner loop must survive whatever the outer loop does
             said = error_text(error)
