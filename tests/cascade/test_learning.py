@@ -481,7 +481,8 @@ def test_what_is_not_explained_asks_for_room(pendulum: ut.Mechanism) -> None:
     ends = [loop.simulate(x, memory.plan, duration=0.1).x[-1] for loop in loops]
     soon = [made._judge.soon(memory, end, 0.1, 9.9) for end in ends]
     assert soon[0] == 9.9
-    part = np.linalg.norm((ends[1] - ends[0])[:2]) / np.linalg.norm((ends[0] - x)[:2])
+    off, way, left = (np.linalg.norm(d[:2]) for d in (ends[1] - ends[0], ends[0] - x, ends[1]))
+    part = off / (way + 1e-3 * left)
     assert part > 0.1
     assert soon[1] == pytest.approx(9.9 / (1 + 5 * (part - 0.03)), rel=1e-3)
 

@@ -24,9 +24,10 @@ from undertow.optimiser import Proposal
 #: that jumps shows in positions at once; what a model does not know shows in velocities first.
 JUMP, PART = 0.1, 0.5
 
-#: What part of a motion may be left unexplained, as one is whose parameters are being learnt; and
-#: how much sooner a plan to be mended is to be home where all of it is.
-UNEXPLAINED, SOONER = 0.03, 5.0
+#: What part of a motion may be left unexplained, as one is whose parameters are being learnt; how
+#: much sooner a plan to be mended is to be home where all of it is; and what part of the distance
+#: left is no motion.
+UNEXPLAINED, SOONER, STILL = 0.03, 5.0, 1e-3
 
 
 class Judge:
@@ -95,7 +96,9 @@ class Judge:
             return span
         n, start = loop.mechanism.n, np.array(state.x)
         motion = loop.batch(start, state.plan, duration=past, terminal=0.0, precise=True)
-        off, way = (np.linalg.norm(d[:n]) for d in (error - motion.x[0], motion.x[0] - start))
+        there = motion.x[0]
+        off, way, left = (np.linalg.norm(d[:n]) for d in (error - there, there - start, error))
+        way += STILL * left
         rest = float(off / way) if math.isfinite(off) and way > 0.0 else 0.0
         return span / (1.0 + SOONER * max(0.0, rest - UNEXPLAINED))
 
