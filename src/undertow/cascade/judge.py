@@ -88,12 +88,14 @@ class Judge:
 
         What no parameter of the model explains, as friction that it does not have, makes a motion
         late: the farther positions are off where the estimate says that the plan in use moved them
-        since the last decision, beside that way, the more room a plan leaves.
+        since the last decision, beside that way, the more room a plan leaves.  Along a reference
+        that moves all of the time is left.
         """
-        loop, past = self.predictions.estimated_at(state), t - state.since
-        known = bool(state.x) and 0.0 < past <= self.objective.horizon
-        if not self.recourse or loop.price_of_time > 0 or not known:
+        past, moves = t - state.since, state.target is not None and state.target.moves
+        known = bool(state.x) and not moves and 0.0 < past <= self.objective.horizon
+        if not self.recourse or self.predictions.prior.price_of_time > 0 or not known:
             return span
+        loop = self.predictions.estimated_at(state)
         n, start = loop.mechanism.n, np.array(state.x)
         motion = loop.batch(start, state.plan, duration=past, terminal=0.0, precise=True)
         there = motion.x[0]
