@@ -277,17 +277,18 @@ def half(x):
 def test_machine_code_that_is_cut_off_is_compiled_again(folder: Path, kept: str) -> None:
     """A disk that was full, a power that was lost; numba ended every later start."""
 
-    def again() -> Path:
+    def again() -> tuple[bool, Path]:
         module = store.load_module("cut", COMPILED)
         del sys.modules[module.__name__]
         assert module.half(3.0) == 1.5
         (path,) = folder.rglob(f"*.{kept}")
-        return path
+        return bool(module.half.stats.cache_hits), path
 
-    path = again()
-    whole = path.read_bytes()
-    path.write_bytes(whole[:20])
-    assert len(again().read_bytes()) == len(whole)
+    read, path = again()
+    assert not read
+    path.write_bytes(path.read_bytes()[:20])
+    assert not again()[0]
+    assert again()[0]
 
 
 def test_machine_code_that_finds_no_room_is_used_all_the_same(

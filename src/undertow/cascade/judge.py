@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -56,6 +57,8 @@ class Judge:
         self.reaching, self.period = reserve.reaching, reserve.period
         guarded = objective.hard_input or predictions.prior.objective != objective
         self._bounds_input = predictions.belief is not None and guarded
+        # A decision asks twice, for the search and for the gate.
+        self._unexplained = lru_cache(maxsize=2)(self._part_unexplained)
 
     def standing(
         self, state: CascadeState, loop: ClosedLoop, plan: Plan, error: FloatArray, span: float,
@@ -87,22 +90,34 @@ class Judge:
         """The time in which a plan to be mended is to be home, of the time ``span`` left, s.
 
         What no parameter of the model explains, as friction that it does not have, makes a motion
-        late: the farther positions are off where the estimate says that the plan in use moved them
-        since the last decision, beside that way, the more room a plan leaves.  Along a reference
-        that moves all of the time is left.
+        late: the more of the last one is unexplained, the more room a plan of a smooth cost leaves.
+        """
+        if not self.recourse or self.predictions.prior.price_of_time > 0:
+            return span
+        rest = self.unexplained(state, error, t)
+        return span / (1.0 + SOONER * max(0.0, rest - UNEXPLAINED))
+
+    def unexplained(self, state: CascadeState, error: FloatArray, t: float) -> float:
+        """What part of the motion since the last decision the estimate does not explain.
+
+        How far positions are off where it says that the plan in use moved them, beside that way.
+        Along a reference that moves nothing is said: 0.
         """
         past, moves = t - state.since, state.target is not None and state.target.moves
-        known = bool(state.x) and not moves and 0.0 < past <= self.objective.horizon
-        if not self.recourse or self.predictions.prior.price_of_time > 0 or not known:
-            return span
+        if moves or not state.x or not 0.0 < past <= self.objective.horizon:
+            return 0.0
         loop = self.predictions.estimated_at(state)
-        n, start = loop.mechanism.n, np.array(state.x)
-        motion = loop.batch(start, state.plan, duration=past, terminal=0.0, precise=True)
-        there = motion.x[0]
-        off, way, left = (np.linalg.norm(d[:n]) for d in (error - there, there - start, error))
+        return self._unexplained(loop, state.plan, state.x, error.tobytes(), past)
+
+    @staticmethod
+    def _part_unexplained(
+        loop: ClosedLoop, plan: Plan, x: tuple[float, ...], error: bytes, past: float
+    ) -> float:
+        n, start, end = loop.mechanism.n, np.array(x), np.frombuffer(error)
+        there = loop.batch(start, plan, duration=past, terminal=0.0, precise=True).x[0]
+        off, way, left = (np.linalg.norm(d[:n]) for d in (end - there, there - start, end))
         way += STILL * left
-        rest = float(off / way) if math.isfinite(off) and way > 0.0 else 0.0
-        return span / (1.0 + SOONER * max(0.0, rest - UNEXPLAINED))
+        return float(off / way) if math.isfinite(off) and way > 0.0 else 0.0
 
     def breaks(
         self, state: CascadeState, plans: list[Plan], error: FloatArray, span: float

@@ -220,64 +220,73 @@ class Planning:
 
         See :meth:`undertow.Cascade.propose`.
         """
-        planners, judge, predictions = self.planners, self.judge, self.predictions
         sequence = state.sequence + 1
         try:
-            error = state.error(t, predictions.prior.mechanism.check_state(x))
-            span = judge.objective.horizon if horizon is None else horizon
-            here, loop, used = replace(state, since=t), predictions.at(state, t), state.at(t)
-            soon = judge.soon(state, error, t, span)
+            error = state.error(t, self.predictions.prior.mechanism.check_state(x))
+            span = self.judge.objective.horizon if horizon is None else horizon
+            soon = self.judge.soon(state, error, t, span)
             ask: dict[str, Any] = {
                 "sequence": sequence,
                 "computed_for": t,
                 "resolution": self.resolution * state.scale,
             }
-            first = state.predicted == state.scale  # nothing was decided since
-            timed = loop.price_of_time > 0
-            # One period shows little of the plant: what suits all costs less then than a guess.
-            if planners.recourse and (timed or not first):
-                estimated = predictions.estimated(state.estimate)
-                optimiser = planners.optimiser_of(estimated, state.target, t)
-                admits = partial(judge.reserve.recovers, loop, error, soon)
-                until = soon if soon < span else horizon
-                spent = (t - state.since) * loop.price_of_time
-                promised = 0.0 if first else state.predicted - spent
-                begins = [(used, promised)]
-                if state.ahead is not None:
-                    begins.append((state.ahead, math.inf))
-                answers: list[Proposal] = []
-                mended: list[Proposal] = []
-                scheduled = optimiser.freedom.schedule > 0
-                # Of single surfaces the best one mostly is admissible; asking all takes long.
-                for asked in (admits,) if scheduled else (None, admits):
-                    for plan, cost in begins if not mended else ():
-                        found = optimiser.propose(
-                            error,
-                            incumbent=plan,
-                            admits=asked,
-                            promised=cost,
-                            horizon=until,
-                            **ask,
-                        )
-                        answers.append(found)
-                        if found.plan and judge.mendable(here, loop, found.plan, error, soon):
-                            mended.append(found)
-                if mended or judge.mendable(here, loop, used, error, soon):
-                    return _best_of(mended or answers[:1], answers)
-            planner = planners.of(predictions.plausible(state.estimate), state.target, t)
-            standing = judge.standing(here, loop, used, error, span, soon)
-            # What suits all may be near what is late on one of them.
-            begin = [standing] if standing is used else [standing, used]
-            near: list[Proposal] = []
-            for until in (soon, horizon) if soon < span else (horizon,):
-                for plan in begin:
-                    near.append(planner.propose(error, incumbent=plan, horizon=until, **ask))
-                if until == horizon or any(found.plan for found in near):
-                    break
-            return _best_of(near, near)
+            horizons = [soon, horizon] if soon < span else [horizon]
+            asks = [ask | {"horizon": longest} for longest in horizons]
+            mended = self._mended(state, error, t, soon, asks[0])
+            return mended or self._suiting_all(state, error, t, soon, span, asks)
         except Exception as error:  # the inner loop must survive whatever the outer loop does
             said = error_text(error)
             return Proposal(None, "failed", math.inf, math.inf, (), 0, 0.0, sequence, t, said)
+
+    def _mended(
+        self, state: CascadeState, error: FloatArray, t: float, soon: float, ask: dict[str, Any]
+    ) -> Proposal | None:
+        """The best plan for the estimate that can be mended; ``None``: what suits all is better.
+
+        Before the first decision of a smooth cost it is: one period shows little of the plant, and
+        what suits all costs less then than a guess.
+        """
+        planners, judge, predictions = self.planners, self.judge, self.predictions
+        loop, price = predictions.at(state, t), predictions.prior.price_of_time
+        first = state.predicted == state.scale  # nothing was decided since
+        if not planners.recourse or (first and not price > 0):
+            return None
+        optimiser = planners.optimiser_of(predictions.estimated(state.estimate), state.target, t)
+        used, now = state.at(t), replace(state, since=t)
+        begins = [(used, 0.0 if first else state.predicted - (t - state.since) * price)]
+        if state.ahead is not None:
+            begins.append((state.ahead, math.inf))
+        admits = partial(judge.reserve.recovers, loop, error, soon)
+        answers: list[Proposal] = []
+        mended: list[Proposal] = []
+        # Of single surfaces the best one mostly is admissible; asking all takes long.
+        for asked in (admits,) if optimiser.freedom.schedule else (None, admits):
+            for plan, cost in begins if not mended else ():
+                found = optimiser.propose(error, incumbent=plan, admits=asked, promised=cost, **ask)
+                answers.append(found)
+                if found.plan and judge.mendable(now, loop, found.plan, error, soon):
+                    mended.append(found)
+        if mended or judge.mendable(now, loop, used, error, soon):
+            return _best_of(mended or answers[:1], answers)
+        return None
+
+    def _suiting_all(
+        self, state: CascadeState, error: FloatArray, t: float, soon: float, span: float,
+        asks: list[dict[str, Any]],
+    ) -> Proposal:  # fmt: skip
+        """The best plan that suits every plausible plant, asked for until there is one."""
+        predictions, used = self.predictions, state.at(t)
+        planner = self.planners.of(predictions.plausible(state.estimate), state.target, t)
+        now, loop = replace(state, since=t), predictions.at(state, t)
+        standing = self.judge.standing(now, loop, used, error, span, soon)
+        # What suits all may be near what is late on one of them.
+        begin = [standing] if standing is used else [standing, used]
+        near: list[Proposal] = []
+        for ask in asks:
+            near += [planner.propose(error, incumbent=plan, **ask) for plan in begin]
+            if any(found.plan for found in near):
+                break
+        return _best_of(near, near)
 
 
 def _best_of(answers: list[Proposal], asked: list[Proposal]) -> Proposal:
