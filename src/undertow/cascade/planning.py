@@ -220,11 +220,12 @@ class Planning:
 
         See :meth:`undertow.Cascade.propose`.
         """
+        planners, judge, predictions = self.planners, self.judge, self.predictions
         sequence = state.sequence + 1
         try:
-            error = state.error(t, self.predictions.prior.mechanism.check_state(x))
-            span = self.judge.objective.horizon if horizon is None else horizon
-            soon = self.judge.soon(state, error, t, span)
+            error = state.error(t, predictions.prior.mechanism.check_state(x))
+            span = judge.objective.horizon if horizon is None else horizon
+            soon = judge.soon(state, error, t, span)
             ask: dict[str, Any] = {
                 "sequence": sequence,
                 "computed_for": t,
@@ -233,7 +234,19 @@ class Planning:
             horizons = [soon, horizon] if soon < span else [horizon]
             asks = [ask | {"horizon": longest} for longest in horizons]
             mended = self._mended(state, error, t, soon, asks[0])
-            return mended or self._suiting_all(state, error, t, soon, span, asks)
+            if mended is not None:
+                return mended
+            # What suits every plausible plant may be near what is late on one of them.
+            used, loop = state.at(t), predictions.at(state, t)
+            standing = judge.standing(replace(state, since=t), loop, used, error, span, soon)
+            planner = planners.of(predictions.plausible(state.estimate), state.target, t)
+            near: list[Proposal] = []
+            for ask in asks:
+                for plan in [standing] if standing is used else [standing, used]:
+                    near.append(planner.propose(error, incumbent=plan, **ask))
+                if any(found.plan for found in near):
+                    break
+            return _best_of(near, near)
         except Exception as error:  # the inner loop must survive whatever the outer loop does
             said = error_text(error)
             return Proposal(None, "failed", math.inf, math.inf, (), 0, 0.0, sequence, t, said)
@@ -269,24 +282,6 @@ class Planning:
         if mended or judge.mendable(now, loop, used, error, soon):
             return _best_of(mended or answers[:1], answers)
         return None
-
-    def _suiting_all(
-        self, state: CascadeState, error: FloatArray, t: float, soon: float, span: float,
-        asks: list[dict[str, Any]],
-    ) -> Proposal:  # fmt: skip
-        """The best plan that suits every plausible plant, asked for until there is one."""
-        predictions, used = self.predictions, state.at(t)
-        planner = self.planners.of(predictions.plausible(state.estimate), state.target, t)
-        now, loop = replace(state, since=t), predictions.at(state, t)
-        standing = self.judge.standing(now, loop, used, error, span, soon)
-        # What suits all may be near what is late on one of them.
-        begin = [standing] if standing is used else [standing, used]
-        near: list[Proposal] = []
-        for ask in asks:
-            near += [planner.propose(error, incumbent=plan, **ask) for plan in begin]
-            if any(found.plan for found in near):
-                break
-        return _best_of(near, near)
 
 
 def _best_of(answers: list[Proposal], asked: list[Proposal]) -> Proposal:
