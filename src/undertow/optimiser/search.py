@@ -84,8 +84,8 @@ CLOSE_BY, HAIR = 512, 1e-3
 #: Evaluations for a single surface where no schedule arrives; twice as many without any plan.
 ALONE = 1024
 
-#: A plan that costs so many times what it promised, however it is improved, is one of many: the
-#: evaluations that another one is looked for with.
+#: Of few parameters, a plan that costs so many times what it promised, however it is improved, is
+#: one of many: the evaluations that another one is looked for with.
 BROKEN, ANEW = 1.05, 16384
 
 #: Time constants of the first surface after which, without any plan, an arrival is looked for.
@@ -355,9 +355,8 @@ def search_earlier(task: Optimisation, incumbent: Plan) -> bool:
         _look_around(task, here)
     if task.optimiser.aims:
         _along_ridge(task, min(POLISH, task.left))
-        converged = _arrive_earlier(task)
-    else:
-        converged = _along_ridge(task, task.left)
+        return _arrive_earlier(task)
+    converged = _along_ridge(task, task.left)
     if task.best_cost > BROKEN * task.promised + 2 * task.loop.step:
         if task.usual:
             task.budget = Budget(task.evaluations + ANEW)
