@@ -139,11 +139,14 @@ def settle(
 
     def compared(a: FloatArray, b: FloatArray) -> tuple[Bools, Bools, FloatArray]:
         """Goals that are not shown, and that are shown false, (N, O), with spreads (N, O, V)."""
-        found = []
+        found, spreads = [], []
         for low, high in zip(a.T, b.T, strict=True):
             side, m = ops.between(low, high), 0.5 * low + 0.5 * high
-            found.append(ops.mean_values(*program.expanded(side, m, fixed), side, m))
-        values, spread = (np.array(v) for v in zip(*found, strict=True))
+            whole, centre = program.expanded(side, m, fixed)
+            found.append(ops.mean_values(whole, centre, side, m))
+            size = np.maximum(abs(whole[:, 1:].real), abs(whole[:, 1:].imag))
+            spreads.append(size * (high - low))
+        values, spread = np.array(found), np.array(spreads)
         below = np.where(sign > 0, values.real, -values.imag)
         above = np.where(sign > 0, values.imag, -values.real)
         shown = np.where(strict, below > bound.imag, below >= bound.imag)

@@ -97,8 +97,7 @@ def down(v):  # type: ignore[no-untyped-def]
 @_njit
 def up(v):  # type: ignore[no-untyped-def]
     """Move an upper end outward."""
-    w = v + (abs(v) * _STEP + _TINY)
-    return w if w == w else (-_MOST if v < 0.0 else v)
+    return -down(-v)
 
 
 @_njit
@@ -136,22 +135,20 @@ def add(x, y):  # type: ignore[no-untyped-def]
 
 
 @_njit
+def _real(v):  # type: ignore[no-untyped-def]
+    """A product of ends: 0 × unbounded is 0, for values are real."""
+    return v if v == v else 0.0
+
+
+@_njit
 def mul(x, y):  # type: ignore[no-untyped-def]
-    """Return x · y; 0 × unbounded is 0, for values are real, but 0 × undefined is not."""
+    """Return x · y; 0 × unbounded is 0, but 0 × undefined is not."""
     a, b, c, d = x.real, x.imag, y.real, y.imag
     if a != a or c != c:
         return _UNDEFINED
     if x == 0.0 or y == 0.0:
         return complex(0.0, 0.0)
-    p, q, r, s = a * c, a * d, b * c, b * d
-    if p != p:
-        p = 0.0
-    if q != q:
-        q = 0.0
-    if r != r:
-        r = 0.0
-    if s != s:
-        s = 0.0
+    p, q, r, s = _real(a * c), _real(a * d), _real(b * c), _real(b * d)
     return complex(down(min(p, q, r, s)), up(max(p, q, r, s)))
 
 
@@ -477,36 +474,22 @@ def _both(x, y):  # type: ignore[no-untyped-def]
 
 
 @_njit
-def mean_values(whole, centre, box, m):  # type: ignore[no-untyped-def]
-    """Values over a box, by their intervals and by f(m) + ∂f (x − m), both of which hold: (O,).
-
-    ``whole`` are values and derivatives over the box (V,), (O, 1 + V), ``centre`` values at
-    doubles m inside, (O,).  Also: how much of each output is due to each variable, (O, V).
-    """
-    out, spread = np.empty_like(centre), np.empty((len(whole), len(box)))
-    for o in range(len(whole)):
-        mean = centre[o]
-        for i in range(len(box)):
-            slope, side = whole[o, 1 + i], complex(down(box[i].real - m[i]), up(box[i].imag - m[i]))
-            mean = add(mean, mul(slope, side))
-            spread[o, i] = magnitude(slope) * (box[i].imag - box[i].real)
-        out[o] = _both(whole[o, 0], mean)
-    return out, spread
-
-
-@_njit
-def along(whole, centre, C, xi, moved):  # type: ignore[no-untyped-def]
-    """Values at m + C ξ + moved (N, 1), by their intervals and their mean values, (O,).
+def along(whole, centre, C, xi):  # type: ignore[no-untyped-def]
+    """Values at m + C ξ, by their intervals and their mean values, both of which hold: (O,).
 
     ``whole`` are values and derivatives over a box that holds them, (O, 1 + N), ``centre``
     values at m, (O,).
     """
-    out, slope = np.empty_like(centre), np.ascontiguousarray(whole[:, 1:])
-    first, second = product(product(slope, points(C)), xi), product(slope, moved)
-    for o in range(len(whole)):
-        mean = add(add(centre[o], first[o, 0]), second[o, 0])
-        out[o] = _both(whole[o, 0], mean)
+    slopes = product(np.ascontiguousarray(whole[:, 1:]), points(C))
+    out = sums(centre, product(slopes, xi)[:, 0])
+    for o in range(len(out)):
+        out[o] = _both(whole[o, 0], out[o])
     return out
+
+
+def mean_values(whole: Any, centre: Any, box: Any, m: Any) -> Any:
+    """Values over a box (N,), m inside, as :func:`along` has them, (O,)."""
+    return along(whole, centre, np.eye(len(m)), sums(box, points(-m))[:, None])
 
 
 # -- interval matrices ----------------------------------------------------------------------------
@@ -526,10 +509,7 @@ def product(A, B):  # type: ignore[no-untyped-def]
 @_njit
 def points(A):  # type: ignore[no-untyped-def]
     """An array of doubles as intervals."""
-    out = np.empty(A.shape, np.complex128)
-    for at, value in np.ndenumerate(A):
-        out[at] = point(value)
-    return out
+    return A * complex(1.0, 1.0)
 
 
 @_njit

@@ -267,7 +267,7 @@ class HeldLoop(Loop):
         m, none, plant = self.model.m, np.zeros(self.model.m, dtype=complex), X[self.size :]
         middle = np.append(np.zeros(self.size), 0.5 * (plant.real + plant.imag))
         over, at = self.inside.expanded(X, middle, self.held.fixed())
-        L = ops.mean_values(over, at, X, middle)[0]
+        L = ops.mean_values(over, at, X, middle)
         return middle, Sampled(none, none, L[m:], at[m:], over[m:, 1:])
 
     def _contracts(self, V: Intervals, X: Intervals) -> tuple[str, float]:
