@@ -52,11 +52,20 @@ def show(good: bool, what: str) -> None:
         raise Settlement("undecided", what)
 
 
+#: The kinds of claims.
+KINDS: dict[str, type[Claim]] = {}
+
+
 class Claim(ABC):
-    """Numbers with a statement about a model and a law."""
+    """Numbers with a statement about a model and a law, and their keys in a file."""
 
     kind: ClassVar[str]
     keys: ClassVar[tuple[str, ...]]
+
+    def __init_subclass__(cls, kind: str, keys: tuple[str, ...]) -> None:
+        """Enter it among the kinds."""
+        cls.kind, cls.keys = kind, keys
+        KINDS[kind] = cls
 
     @classmethod
     @abstractmethod
@@ -88,11 +97,9 @@ def _routh(coefficients: list[Span]) -> bool | None:
 
 
 @dataclass(frozen=True)
-class Stability(Claim):
+class Stability(Claim, kind="stability", keys=("rate",)):
     """Every eigenvalue of the motion on the surface, at the target, is left of −rate, 1/s."""
 
-    kind: ClassVar[str] = "stability"
-    keys: ClassVar[tuple[str, ...]] = ("rate",)
     rate: Fraction
 
     @classmethod
@@ -171,11 +178,9 @@ def _over_region(
 
 
 @dataclass(frozen=True)
-class Nonsingular(Claim):
+class Nonsingular(Claim, kind="nonsingular", keys=("region", "ratio")):
     """The law exists all over a region, where det Γ(q)/det Γ(0) ≥ ratio."""
 
-    kind: ClassVar[str] = "nonsingular"
-    keys: ClassVar[tuple[str, ...]] = ("region", "ratio")
     region: Region
     ratio: Fraction
 
@@ -197,11 +202,9 @@ class Nonsingular(Claim):
 
 
 @dataclass(frozen=True)
-class Reaching(Claim):
+class Reaching(Claim, kind="reaching", keys=("region", "disturbance", "rate")):
     """The law overcomes disturbances over a region, and leaves a rate of reaching."""
 
-    kind: ClassVar[str] = "reaching"
-    keys: ClassVar[tuple[str, ...]] = ("region", "disturbance", "rate")
     region: Region
     disturbance: tuple[Fraction, ...]
     rate: tuple[Fraction, ...]
@@ -234,11 +237,9 @@ class Reaching(Claim):
 
 
 @dataclass(frozen=True)
-class TerminalEllipsoid(Claim):
+class TerminalEllipsoid(Claim, kind="terminal ellipsoid", keys=("W", "radius")):
     """{|W x| ≤ radius} is a terminal set of the closed loop, inside layer and input limits."""
 
-    kind: ClassVar[str] = "terminal ellipsoid"
-    keys: ClassVar[tuple[str, ...]] = ("W", "radius")
     W: Matrix
     radius: Fraction
 
@@ -293,11 +294,11 @@ def _read_plant(data: Any, model: Model) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class SurfaceRegion(Claim):
+class SurfaceRegion(
+    Claim, kind="surface region", keys=("stretch", "pole", "functions", "contains", "plant")
+):
     """Motions on the surface converge from a set, shown by one function after another."""
 
-    kind: ClassVar[str] = "surface region"
-    keys: ClassVar[tuple[str, ...]] = ("stretch", "pole", "functions", "contains", "plant")
     stretch: Stretch
     functions: tuple[Function, ...]
     contains: tuple[Fraction, ...]
@@ -358,11 +359,11 @@ MOST_STATES = 12
 
 
 @dataclass(frozen=True)
-class ClosedLoop(Claim):
+class ClosedLoop(
+    Claim, kind="closed loop", keys=("starts", "period", "plant", "disturbance", "ball")
+):
     """Every motion from a box of starts converges, layer and clip and all."""
 
-    kind: ClassVar[str] = "closed loop"
-    keys: ClassVar[tuple[str, ...]] = ("starts", "period", "plant", "disturbance", "ball")
     starts: Region
     period: Fraction
     plant: Region
@@ -444,11 +445,6 @@ class ClosedLoop(Claim):
 
 
 # -- all of them ----------------------------------------------------------------------------------
-
-KINDS: Mapping[str, type[Claim]] = {
-    claim.kind: claim
-    for claim in (Stability, Nonsingular, Reaching, TerminalEllipsoid, SurfaceRegion, ClosedLoop)
-}
 
 
 def read_claim(data: Mapping[str, Any], model: Model) -> Claim:

@@ -770,14 +770,12 @@ def models(code, constants, outputs, low, high):  # type: ignore[no-untyped-def]
         T[V + i, E] = (constants[i].imag - constants[i].real) * _GROW + _LITTLE
     out = np.empty((boxes, len(outputs), E + 1))
     for start in range(0, boxes, LANES):
+        lanes = np.minimum(np.arange(start, start + LANES), boxes - 1)
+        left, right = low[:, lanes], high[:, lanes]
+        middle = 0.5 * left + 0.5 * right
+        radius = np.maximum(right - middle, middle - left) * _GROW
         for i in range(V):
-            for lane in range(LANES):
-                at = min(start + lane, boxes - 1)
-                a, b = low[i, at], high[i, at]
-                c = 0.5 * a + 0.5 * b
-                radius = max(b - c, c - a) * _GROW
-                T[i, 0, lane], T[i, 1 + i, lane], T[i, E + 1, lane] = c, radius, radius
-                T[i, E, lane] = _LITTLE
+            T[i, 0], T[i, 1 + i], T[i, E + 1], T[i, E] = middle[i], radius[i], radius[i], _LITTLE
         for line in range(len(code)):
             op, a, b = code[line]
             C = T[first + line]
@@ -798,10 +796,9 @@ def models(code, constants, outputs, low, high):  # type: ignore[no-untyped-def]
                     _times(T[a], T[-1], C, V)
             else:
                 C[:] = math.nan
-        for lane in range(min(LANES, boxes - start)):
-            for o in range(len(outputs)):
-                for k in range(E + 1):
-                    out[start + lane, o, k] = T[outputs[o], k, lane]
+        count = min(LANES, boxes - start)
+        for o in range(len(outputs)):
+            out[start : start + count, o] = T[outputs[o], : E + 1, :count].T
     return out
 
 

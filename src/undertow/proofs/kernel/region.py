@@ -214,12 +214,13 @@ class Stage:
         models = ops.models(program.code, program.constants, program.outputs, a, b)
         values, spread = ops.ranges(models, len(a))
         low, high = values.T.real, values.T.imag
-        near = high[4] < 1.0
+        outside, near, falls = (low[1] > 1.0) | (low[3] > 1.0), high[4] < 1.0, high[0] < 0.0
+        open_yet = near & ~(outside | falls)
+        falls[open_yet] = ops.excluded(models[open_yet, :3], len(a))
         far = np.maximum(abs(a), abs(b))[: self.size]
         home = (far <= core[:, None]).all(axis=0) | (near & (high[2] < 1.0))
-        falls = (high[0] < 0.0) | (near & ops.excluded(models[:, :3], len(a)))
         inside = (high[3] < 1.0) & (home | (falls & (low[5:] > 0.0).all(axis=0)))
-        return ~((low[1] > 1.0) | (low[3] > 1.0) | inside)[None], spread[:, 0].T
+        return ~(outside | inside)[None], spread[:, 0].T
 
     def _named(self, point: Sequence[float]) -> Point:
         x = np.array(point)
