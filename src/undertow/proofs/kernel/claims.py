@@ -399,19 +399,15 @@ class ClosedLoop(
 
     def decide(self, model: Model, law: Law, max_boxes: int) -> Decision:
         """Decide the statement."""
-        known = not any(self.disturbance) and (not self.plant or self.period)
-        show(
-            bool(known),
-            "forces, and other plants under an input that is not held: not decided here",
-        )
-        plain = law.switching == "saturation" and not any(law.disturbance)
-        show(
-            plain and self.terminal is not None,
-            "saturation, constant gains and a terminal set are needed",
-        )
+        forces = "forces, and other plants under an input that is not held: not decided here"
+        show(not any(self.disturbance) and (not self.plant or self.period > 0), forces)
+        terminal, plain = self.terminal, law.switching == "saturation" and not any(law.disturbance)
+        if terminal is None or not plain:
+            needed = "saturation, constant gains and a terminal set are needed"
+            raise Settlement("undecided", needed)
         few = 2 * model.n + len(self.plant) <= MOST_STATES
         show(few, f"more than {MOST_STATES} states and parameters that vary")
-        loop = self._loop(model, law)
+        loop = self._loop(model, law, terminal)
         box = {x: self.starts.get(x, (Fraction(0), Fraction(0))) for x in model.states}
         wide = [x for x, (low, high) in box.items() if low < high]
         if wide and system(model, law).odd and all(low == -high for low, high in box.values()):
@@ -429,10 +425,8 @@ class ClosedLoop(
             return Decision("undecided", f"{method}: a tube is lost", witness, details)
         return Decision("proved", method, details=details)
 
-    def _loop(self, model: Model, law: Law) -> Loop:
+    def _loop(self, model: Model, law: Law, end: TerminalEllipsoid) -> Loop:
         """The loop with its terminal set."""
-        end = self.terminal
-        assert end is not None
         if not self.period:
             found = decide(model, law, end)
             show(found.kind == "proved", f"the terminal set: {found.why}")

@@ -466,14 +466,6 @@ def jets(code, constants, box, rates, order, seeds):  # type: ignore[no-untyped-
 
 
 @_njit
-def _both(x, y):  # type: ignore[no-untyped-def]
-    """What two intervals that both hold have in common; the first where one is undefined."""
-    if x != x or y != y:
-        return x
-    return complex(max(x.real, y.real), min(x.imag, y.imag))
-
-
-@_njit
 def along(whole, centre, C, xi):  # type: ignore[no-untyped-def]
     """Values at m + C ξ, by their intervals and their mean values, both of which hold: (O,).
 
@@ -482,8 +474,9 @@ def along(whole, centre, C, xi):  # type: ignore[no-untyped-def]
     """
     slopes = product(np.ascontiguousarray(whole[:, 1:]), points(C))
     out = sums(centre, product(slopes, xi)[:, 0])
-    for o in range(len(out)):
-        out[o] = _both(whole[o, 0], out[o])
+    for o, x in enumerate(whole[:, 0]):
+        y = out[o]
+        out[o] = complex(max(x.real, y.real), min(x.imag, y.imag)) if x == x and y == y else x
     return out
 
 

@@ -285,8 +285,8 @@ class System:
 
     @property
     def regular(self) -> list[Node]:
-        """Pivots of M, which are to be > 0, then det B and det Γ, which are not to be 0."""
-        return [*self.pivots, self.B_determinant, self.gamma_determinant]
+        """What :func:`is_regular` asks of: pivots of M (Lemma 2), then det B and det Γ."""
+        return [*self.uu[1], *self.ss[1], self.B_determinant, self.gamma_determinant]
 
     @property
     def odd(self) -> bool:
@@ -302,11 +302,6 @@ class System:
         actuated = self.gamma @ solve(self.ss, identity(m, number))
         rest = self.alpha_u - actuated @ self.M_au
         return np.hstack([actuated, rest @ solve(self.uu, identity(self.model.n - m, number))])
-
-    @property
-    def pivots(self) -> list[Node]:
-        """Those of M with the unactuated block first: all > 0 iff M is positive definite."""
-        return [*self.uu[1], *self.ss[1]]
 
     @cached_property
     def s(self) -> Array:
