@@ -26,7 +26,7 @@ THINNEST, MOST_PLANTS = 2.0**-16, 512
 #: How far inside the layer, of its width, a set is cut at its edge: a part of one piece.
 EDGE = 2.0**-10
 
-
+#: What may not be shown of a terminal set.
 SINGULAR, IRREGULAR = "W is not shown to be invertible", "model and law are not shown to be regular"
 LAYER_LEFT, LIMIT_MET = "the boundary layer is left", "an input limit is met"
 
