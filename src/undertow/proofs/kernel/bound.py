@@ -115,6 +115,7 @@ def branch(
     return Settled("proved", "", (), count)
 
 
+@np.errstate(invalid="ignore")  # a slope without bounds, across a side of width 0
 def settle(
     program: Program,
     box: Sequence[tuple[Fraction, Fraction]],

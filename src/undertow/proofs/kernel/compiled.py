@@ -601,12 +601,6 @@ def moved(X, rates, h):  # type: ignore[no-untyped-def]
 
 
 @_njit
-def hulled(m, C, xi):  # type: ignore[no-untyped-def]
-    """The box around m + C ξ, (N,)."""
-    return sums(points(m), product(points(C), xi)[:, 0])
-
-
-@_njit
 def taylor_step(rest, centre, around, h, m, C, xi):  # type: ignore[no-untyped-def]
     """{m + C ξ} after h, Lemma 6: new m and C into theirs; the box (N, 1) that is to be added.
 

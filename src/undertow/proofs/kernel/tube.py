@@ -311,7 +311,8 @@ class Tube:
         self.xi = np.concatenate([self.xi, added])
         if self.C.shape[1] > MOST_COLUMNS:
             self.C, self.xi = _folded(self.C, self.xi, KEPT_COLUMNS)
-        self.hull = ops.hulled(self.m, self.C, self.xi)
+        around = ops.product(ops.points(self.C), self.xi)[:, 0]
+        self.hull = ops.sums(ops.points(self.m), around)
         return True
 
 
