@@ -311,8 +311,8 @@ class Tube:
         self.xi = np.concatenate([self.xi, added])
         if self.C.shape[1] > MOST_COLUMNS:
             self.C, self.xi = _folded(self.C, self.xi, KEPT_COLUMNS)
-        around = ops.product(ops.points(self.C), self.xi)[:, 0]
-        self.hull = ops.sums(ops.points(self.m), around)
+        spread = ops.product(ops.points(self.C), self.xi)[:, 0]
+        self.hull = ops.sums(ops.points(self.m), spread)
         return True
 
 
