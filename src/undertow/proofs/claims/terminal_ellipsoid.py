@@ -31,6 +31,7 @@ from undertow.proofs.claims.words import limits_words, sentence, verdict_on
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.compiled import between
 from undertow.proofs.kernel.graph import Graph, Intervals, Span
+from undertow.proofs.kernel.loop import ellipsoid
 from undertow.proofs.kernel.model import Law, Model, System
 from undertow.proofs.require import require_autonomous
 
@@ -133,7 +134,7 @@ class ClosedLoopProgram:
         parts = *layout.blocks(numbers), numbers[layout.eta], numbers[layout.layer]
         law = Law(*cast(Any, (*parts, switching, bounds)))
         own = System(model, law, graph=graph, leaves=graph.inputs[:fixed])
-        self.program = kernel.ellipsoid_program(own)
+        self.program = own.within_layer
         self.own = own
 
     @classmethod
@@ -213,10 +214,10 @@ def prove(
     limits: FloatArray,
     found: TerminalEllipsoid,
     centre: Intervals | None = None,
-) -> tuple[int, float, FloatArray]:
-    """Run the kernel's rule: the index of what is not shown, the margin, the box's half-sides."""
+) -> tuple[str, float, FloatArray]:
+    """Run the kernel's rule: what is not shown, if anything, the margin, the box's half-sides."""
     (C, layer), W = rows, found.W
-    return kernel.ellipsoid(
+    return ellipsoid(
         loop.program, between(numbers, numbers), between(W, W), found.radius, between(C, C), layer,
         limits, centre,
     )  # fmt: skip

@@ -17,37 +17,10 @@ import numpy as np
 
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.bound import Goal, settle
-from undertow.proofs.kernel.graph import (
-    Array,
-    FloatArray,
-    Graph,
-    Intervals,
-    Node,
-    Program,
-    Span,
-)
-from undertow.proofs.kernel.loop import ContinuousLoop, HeldLoop, Loop
-from undertow.proofs.kernel.model import (
-    Law,
-    Matrix,
-    Model,
-    Sliding,
-    System,
-    characteristic,
-    identity,
-    input_limits,
-    solve,
-    system,
-)
-from undertow.proofs.kernel.reader import (
-    Document,
-    fields,
-    interval,
-    matrix,
-    number,
-    numbers,
-    require,
-)
+from undertow.proofs.kernel.graph import Array, Graph, Node, Span
+from undertow.proofs.kernel.loop import ContinuousLoop, HeldLoop, Loop, ellipsoid
+from undertow.proofs.kernel.model import Law, Matrix, Model, Sliding, System, characteristic, system
+from undertow.proofs.kernel.reader import Document, box, fields, matrix, number, numbers, require
 from undertow.proofs.kernel.region import Function, Stage, Stretch, on_the_line
 
 Region = Mapping[str, tuple[Fraction, Fraction]]
@@ -69,11 +42,30 @@ class Decision:
     details: Mapping[str, Any] = field(default_factory=dict)
 
 
+class Settlement(Exception):  # noqa: N818
+    """A verdict that leaves nothing else to be decided, and why."""
+
+
+def show(good: bool, what: str) -> None:
+    """Leave a claim undecided for what is not good."""
+    if not good:
+        raise Settlement("undecided", what)
+
+
+#: The kinds of claims.
+KINDS: dict[str, type[Claim]] = {}
+
+
 class Claim(ABC):
-    """Numbers with a statement about a model and a law."""
+    """Numbers with a statement about a model and a law, and their keys in a file."""
 
     kind: ClassVar[str]
     keys: ClassVar[tuple[str, ...]]
+
+    def __init_subclass__(cls, kind: str, keys: tuple[str, ...]) -> None:
+        """Enter it among the kinds."""
+        cls.kind, cls.keys = kind, keys
+        KINDS[kind] = cls
 
     @classmethod
     @abstractmethod
@@ -82,7 +74,7 @@ class Claim(ABC):
 
     @abstractmethod
     def decide(self, model: Model, law: Law, max_boxes: int) -> Decision:
-        """Decide the statement."""
+        """Decide the statement, or say by :func:`show` what is not shown."""
 
 
 # -- linear algebra on exact numbers --------------------------------------------------------------
@@ -105,11 +97,9 @@ def _routh(coefficients: list[Span]) -> bool | None:
 
 
 @dataclass(frozen=True)
-class Stability(Claim):
+class Stability(Claim, kind="stability", keys=("rate",)):
     """Every eigenvalue of the motion on the surface, at the target, is left of −rate, 1/s."""
 
-    kind: ClassVar[str] = "stability"
-    keys: ClassVar[tuple[str, ...]] = ("rate",)
     rate: Fraction
 
     @classmethod
@@ -122,8 +112,6 @@ class Stability(Claim):
     def decide(self, model: Model, law: Law, max_boxes: int) -> Decision:
         """Decide the statement."""
         matrix = _sliding_matrix(model, law)
-        if isinstance(matrix, Decision):
-            return matrix
         exact = all(v.exact for v in matrix.flat)
         method = f"Routh array in {'exact rationals' if exact else 'rational intervals'}"
         diagonal = np.diag_indices(len(matrix))
@@ -132,8 +120,8 @@ class Stability(Claim):
         return Decision({True: "proved", False: "refuted", None: "undecided"}[stable], method)
 
 
-def _sliding_matrix(model: Model, law: Law) -> Array | Decision:
-    """Return A of ż = A z, z = (q_a, q_u, v_u), or a verdict and why there is none."""
+def _sliding_matrix(model: Model, law: Law) -> Array:
+    """Return A of ż = A z, z = (q_a, q_u, v_u)."""
     n, m, size = model.n, model.m, 2 * model.n - model.m
     graph = Graph(size)
     q, v_u = np.split(graph.inputs, [n])
@@ -142,50 +130,34 @@ def _sliding_matrix(model: Model, law: Law) -> Array | Decision:
     on = Sliding.of(graph, model, law, q, pull, v_u, own)
     rates, at = [*on.v_a, *v_u, *on.v_u_dot], [Span(0)] * size
     none = "det(M_uu − M_ua α_a⁻¹ α_u) = 0 at the target, or det α_a = 0: no sliding dynamics"
-    if not all(v.low > 0 for v in graph.exact(on.pivots, at)):
-        return Decision("undecided", "M is not shown to be positive definite at the target")
+    definite = all(v.low > 0 for v in graph.exact(on.pivots, at))
+    show(definite, "M is not shown to be positive definite at the target")
     for k in on.determinants:
         (value,) = graph.exact([k], at)
         if value.zero:
-            return Decision("refuted", none)
-        if not _sign(value):
-            return Decision("undecided", f"not excluded: {none}")
+            raise Settlement("refuted", none)
+        show(bool(_sign(value)), f"not excluded: {none}")
     values, one = graph.exact(rates, at), graph.number(1)
     slopes = [graph.exact(graph.tangents(rates, {k: one}), at) for k in graph.inputs]
-    if not all(v.zero for v in values):
-        return Decision("undecided", "f_u(0, 0) = 0 is not shown exactly")
+    show(all(v.zero for v in values), "f_u(0, 0) = 0 is not shown exactly")
     return np.array(slopes, dtype=object).T
 
 
 # -- 5.2, 5.3 -------------------------------------------------------------------------------------
 
 
-def _read_box(data: Any, known: Mapping[str, Fraction | None]) -> dict[str, Any]:
-    """Read a box of known names, around their values where they have one."""
-    require(isinstance(data, dict), "a box: an object")
-    box = {}
-    for name, ends in data.items():
-        require(name in known, f"a box of {name[:64]!r}, which the model does not have there")
-        low, high = box[name] = interval(ends)
-        inside = known[name]
-        good = inside is None or low <= inside <= high
-        require(good, f"a box of {name!r} without its {float(inside or 0):g}")
-    return box
-
-
 def _read_region(data: Any, model: Model) -> dict[str, Any]:
-    return _read_box(data, {p.name: Fraction(0) for p in model.positions})
+    return box(data, {p.name: Fraction(0) for p in model.positions})
 
 
 def _sign(value: Span) -> int:
     return 1 if value.low > 0 else -1 if value.high < 0 else 0
 
 
-def _regular(own: System) -> tuple[list[Node], list[Goal], Span] | str:
-    """Nodes and goals of regularity, and det Γ(0); or why the target itself is not regular."""
+def _regular(own: System) -> tuple[list[Node], list[Goal], Span]:
+    """Nodes and goals of regularity, and det Γ(0)."""
     drive, gamma = own.graph.exact([own.B_determinant, own.gamma_determinant], own.origin())
-    if not _sign(drive) or not _sign(gamma):
-        return "det B or det Γ may be 0 at the target"
+    show(bool(_sign(drive) and _sign(gamma)), "det B or det Γ may be 0 at the target")
     goals = [Goal(f"pivot {k + 1} of M is > 0") for k in range(own.model.n)]
     goals += [Goal("det B keeps its sign", _sign(drive)), Goal("Γ is non-singular", _sign(gamma))]
     return own.regular, goals, gamma
@@ -194,26 +166,21 @@ def _regular(own: System) -> tuple[list[Node], list[Goal], Span] | str:
 def _over_region(
     own: System, box: Region, nodes: Sequence[Node], goals: Sequence[Goal], max_boxes: int
 ) -> Decision:
-    n = own.model.n
-    zero = (Fraction(0), Fraction(0))
-    ends = [box.get(p.name, zero) for p in own.model.positions]
-    fixed = np.concatenate([np.zeros(n), own.fixed()])
-    found = settle(own.graph.program(nodes), ends, fixed, goals, max_boxes)
-    method = "intervals and mean values, branch and bound"
-    why = method if found.kind == "proved" else f"{method}: {found.why}, not shown"
     names = [p.name for p in own.model.positions]
+    ends = [box.get(name, (Fraction(0), Fraction(0))) for name in names]
+    fixed = np.concatenate([np.zeros(own.model.n), own.fixed()])
+    found = settle(own.graph.program(nodes), ends, fixed, goals, max_boxes)
+    outcome = {"proved": "", "refuted": f"; false: {found.why}"}
+    why = outcome.get(found.kind, f": {found.why}, not shown")
     witness = dict(zip(names, found.point, strict=False))
-    if found.kind == "refuted":
-        why = f"{method}; false: {found.why}"
-    return Decision(found.kind, why, witness, {"boxes": found.boxes})
+    method = f"intervals and mean values, branch and bound{why}"
+    return Decision(found.kind, method, witness, {"boxes": found.boxes})
 
 
 @dataclass(frozen=True)
-class Nonsingular(Claim):
+class Nonsingular(Claim, kind="nonsingular", keys=("region", "ratio")):
     """The law exists all over a region, where det Γ(q)/det Γ(0) ≥ ratio."""
 
-    kind: ClassVar[str] = "nonsingular"
-    keys: ClassVar[tuple[str, ...]] = ("region", "ratio")
     region: Region
     ratio: Fraction
 
@@ -227,23 +194,17 @@ class Nonsingular(Claim):
     def decide(self, model: Model, law: Law, max_boxes: int) -> Decision:
         """Decide the statement."""
         own = system(model, law)
-        regular = _regular(own)
-        if isinstance(regular, str):
-            return Decision("undecided", regular)
-        nodes, goals, gamma = regular
+        nodes, goals, gamma = _regular(own)
         least = gamma * Span(_sign(gamma) * self.ratio)
-        bound = Goal(
-            "det Γ/det Γ(0) is as stated", _sign(gamma), ops.hull(least.low, least.high), False
-        )
+        least_double = ops.hull(least.low, least.high)
+        bound = Goal("det Γ/det Γ(0) is as stated", _sign(gamma), least_double, strict=False)
         return _over_region(own, self.region, [*nodes, nodes[-1]], [*goals, bound], max_boxes)
 
 
 @dataclass(frozen=True)
-class Reaching(Claim):
+class Reaching(Claim, kind="reaching", keys=("region", "disturbance", "rate")):
     """The law overcomes disturbances over a region, and leaves a rate of reaching."""
 
-    kind: ClassVar[str] = "reaching"
-    keys: ClassVar[tuple[str, ...]] = ("region", "disturbance", "rate")
     region: Region
     disturbance: tuple[Fraction, ...]
     rate: tuple[Fraction, ...]
@@ -257,73 +218,28 @@ class Reaching(Claim):
 
     def decide(self, model: Model, law: Law, max_boxes: int) -> Decision:
         """Decide the statement."""
-        if law.switching == "tanh":
-            return Decision("undecided", "tanh is less than 1 everywhere: (16) is not stated of it")
+        show(law.switching != "tanh", "tanh is less than 1 everywhere: (16) is not stated of it")
         own = system(model, law)
-        regular = _regular(own)
-        if isinstance(regular, str):
-            return Decision("undecided", regular)
-        nodes, goals, _ = regular
-        number, m = own.graph.number, model.m
-        actuated = own.gamma @ solve(own.ss, identity(m, number))
-        rest = own.alpha_u - actuated @ own.M_au
-        free = rest @ solve(own.uu, identity(model.n - m, number))
-        for i in range(m):
-            left = own.gains[i] - number(self.rate[i])
-            for weight, bound in zip([*actuated[i], *free[i]], self.disturbance, strict=True):
+        nodes, goals, _ = _regular(own)
+        for i, row in enumerate(own.thrust):
+            left = own.gains[i] - self.rate[i]
+            for weight, bound in zip(row, self.disturbance, strict=True):
                 left = left - abs(weight) * bound
-            if (known := left.number) is not None:
-                if known < 0:
-                    return Decision("refuted", f"k_{i + 1} − η̃_{i + 1} = {float(known):.4g} < 0")
-            else:
-                nodes = [*nodes, left]
-                goals = [*goals, Goal(f"row {i + 1} of (16)", strict=False)]
+            if left.number is not None and left.number < 0:
+                why = f"k_{i + 1} − η̃_{i + 1} = {float(left.number):.4g} < 0"
+                return Decision("refuted", why)
+            if left.number is None:
+                nodes, goals = [*nodes, left], [*goals, Goal(f"row {i + 1} of (16)", strict=False)]
         return _over_region(own, self.region, nodes, goals, max_boxes)
 
 
 # -- 5.4 ------------------------------------------------------------------------------------------
 
-#: What is not shown, by number.
-REASONS = (
-    "", "W is not shown to be invertible", "model and law are not shown to be regular",
-    "the boundary layer is left", "an input limit is met", "V̇ < 0 is not shown",
-)  # fmt: skip
-
-
-def ellipsoid(
-    program: Program, fixed: Intervals, W: Intervals, radius: float, C: Intervals,
-    layer: FloatArray, limits: FloatArray, centre: Intervals | None = None,
-) -> tuple[int, float, FloatArray]:  # fmt: skip
-    """Decide Lemma 5, as ``compiled.ellipsoid`` says: code, margin, half-sides of Q.
-
-    ``centre`` are the program's values at x = 0, where they are known already.
-    """
-    size = len(W)
-    V = ops.inverse(W)
-    half = np.array([ops.up(ops.norm(row) * radius) for row in V])
-    if not (np.isfinite(V).all() and np.isfinite(half).all()):
-        return 1, -math.inf, np.zeros(size)
-    if centre is None:
-        centre = program(np.concatenate([np.zeros(size), fixed]))[:, 0]
-    whole = program(np.concatenate([ops.between(-half, half), fixed]), size)
-    if np.isnan(whole).any():  # something is undefined in Q
-        return 2, -math.inf, half
-    code, margin = ops.ellipsoid(V, whole, centre, W, radius, C, layer, limits)
-    return int(code), float(margin), half
-
-
-def ellipsoid_program(own: System) -> Program:
-    """Return q̈, the demand, pivots, det B and det Γ of the loop inside the layer."""
-    q_dd, demand = own.loop(own.push(layer=True))
-    return own.graph.program([*q_dd, *demand, *own.regular])
-
 
 @dataclass(frozen=True)
-class TerminalEllipsoid(Claim):
+class TerminalEllipsoid(Claim, kind="terminal ellipsoid", keys=("W", "radius")):
     """{|W x| ≤ radius} is a terminal set of the closed loop, inside layer and input limits."""
 
-    kind: ClassVar[str] = "terminal ellipsoid"
-    keys: ClassVar[tuple[str, ...]] = ("W", "radius")
     W: Matrix
     radius: Fraction
 
@@ -336,26 +252,19 @@ class TerminalEllipsoid(Claim):
 
     def decide(self, model: Model, law: Law, max_boxes: int) -> Decision:
         """Decide the statement."""
-        if law.switching == "sign":
-            return Decision("undecided", "with sign(s) there is no layer to be inside of")
+        show(law.switching != "sign", "with sign(s) there is no layer to be inside of")
         own = system(model, law)
-        if why := own.graph.not_zero(own.f[model.m :], own.origin(), "f_u(0, 0) = 0"):
-            return Decision("undecided", why)  # and if it is, q̈ = 0
-        code, margin, half = ellipsoid(
-            ellipsoid_program(own), own.fixed(), ops.hulls(self.W), ops.hull(self.radius).imag,
-            _rows(law), ops.hulls(law.layer).real.copy(), input_limits(model),
+        moves = own.graph.not_zero(own.f[model.m :], own.origin(), "f_u(0, 0) = 0")
+        show(not moves, moves)  # and if it is, q̈ = 0
+        why, margin, half = ellipsoid(
+            own.within_layer, own.fixed(), ops.hulls(self.W), ops.hull(self.radius).imag,
+            law.rows, ops.hulls(law.layer).real.copy(), model.limits,
         )  # fmt: skip
-        details = {"margin": float(margin), "box": half.tolist()}
+        details = {"margin": margin, "box": half.tolist()}
         witness = dict(zip(model.states, half.tolist(), strict=True))
         method = "interval Jacobian over the ellipsoid's box, diagonal dominance"
-        if code == 0:
-            return Decision("proved", method, witness, details)
-        return Decision("undecided", f"{method}: {REASONS[code]}", witness, details)
-
-
-def _rows(law: Law) -> Intervals:
-    """C of s = C x, enclosed, (m, 2n)."""
-    return np.hstack([*map(ops.hulls, (law.lambda_a, law.lambda_u, law.alpha_a, law.alpha_u))])
+        method, kind = (f"{method}: {why}", "undecided") if why else (method, "proved")
+        return Decision(kind, method, witness, details)
 
 
 # -- 5.5 ------------------------------------------------------------------------------------------
@@ -381,15 +290,15 @@ def _function(data: Any, size: int) -> Function:
 
 
 def _read_plant(data: Any, model: Model) -> dict[str, Any]:
-    return _read_box(data, {p.name: p.value for p in model.parameters})
+    return box(data, {p.name: p.value for p in model.parameters})
 
 
 @dataclass(frozen=True)
-class SurfaceRegion(Claim):
+class SurfaceRegion(
+    Claim, kind="surface region", keys=("stretch", "pole", "functions", "contains", "plant")
+):
     """Motions on the surface converge from a set, shown by one function after another."""
 
-    kind: ClassVar[str] = "surface region"
-    keys: ClassVar[tuple[str, ...]] = ("stretch", "pole", "functions", "contains", "plant")
     stretch: Stretch
     functions: tuple[Function, ...]
     contains: tuple[Fraction, ...]
@@ -415,12 +324,9 @@ class SurfaceRegion(Claim):
 
     def decide(self, model: Model, law: Law, max_boxes: int) -> Decision:
         """Decide the statement."""
-        names = (
-            *surface_names(model),
-            *(p.name for p in model.parameters if p.name in self.plant),
-        )
-        if len(names) > 8:
-            return Decision("undecided", f"{len(names)} variables; 8 at most")
+        varied = [p.name for p in model.parameters if p.name in self.plant]
+        names = *surface_names(model), *varied
+        show(len(names) <= 8, f"{len(names)} variables; 8 at most")
         method, boxes = "quadratic Taylor models, branch and bound", 0
         before: Function | None = None
         for k, V in enumerate(self.functions, start=1):
@@ -453,11 +359,11 @@ MOST_STATES = 12
 
 
 @dataclass(frozen=True)
-class ClosedLoop(Claim):
+class ClosedLoop(
+    Claim, kind="closed loop", keys=("starts", "period", "plant", "disturbance", "ball")
+):
     """Every motion from a box of starts converges, layer and clip and all."""
 
-    kind: ClassVar[str] = "closed loop"
-    keys: ClassVar[tuple[str, ...]] = ("starts", "period", "plant", "disturbance", "ball")
     starts: Region
     period: Fraction
     plant: Region
@@ -470,7 +376,7 @@ class ClosedLoop(Claim):
     @classmethod
     def read(cls, data: Mapping[str, Any], model: Model) -> Self:
         """Read it from an object with its keys."""
-        box = _read_box(data["starts"], dict.fromkeys(model.states))
+        starts = box(data["starts"], dict.fromkeys(model.states))
         bounds, period = numbers(data["disturbance"], model.n), number(data["period"])
         ball, hint = number(data["ball"]), data.get("hint", {})
         require(min(*bounds, period, ball) >= 0, "a period, bounds of disturbances and a ball ≥ 0")
@@ -478,7 +384,7 @@ class ClosedLoop(Claim):
         fields(hint, "hint", (), {"terminal", "step", "boxes"})
         cuts = hint.get("boxes", {})
         plant = _read_plant(data["plant"], model)
-        known = {*box, *plant}
+        known = {*starts, *plant}
         require(isinstance(cuts, dict) and cuts.keys() <= known, "boxes: what varies at the start")
         require(all(isinstance(v, list) for v in cuts.values()), "boxes: lists")
         cuts = {name: numbers(v, len(v)) for name, v in cuts.items()}
@@ -489,21 +395,19 @@ class ClosedLoop(Claim):
         if terminal is not None:
             fields(terminal, "terminal", TerminalEllipsoid.keys)
             terminal = TerminalEllipsoid.read(terminal, model)
-        return cls(box, period, plant, bounds, ball, terminal, cuts, step)
+        return cls(starts, period, plant, bounds, ball, terminal, cuts, step)
 
     def decide(self, model: Model, law: Law, max_boxes: int) -> Decision:
         """Decide the statement."""
-        if any(self.disturbance) or (self.plant and not self.period):
-            why = "forces, and other plants under an input that is not held: not decided here"
-            return Decision("undecided", why)
-        if law.switching != "saturation" or any(law.disturbance) or self.terminal is None:
-            why = "saturation, constant gains and a terminal set are needed"
-            return Decision("undecided", why)
-        if 2 * model.n + len(self.plant) > MOST_STATES:
-            return Decision("undecided", f"more than {MOST_STATES} states and parameters that vary")
-        loop = self._loop(model, law, self.terminal)
-        if isinstance(loop, str):
-            return Decision("undecided", f"the terminal set: {loop}")
+        forces = "forces, and other plants under an input that is not held: not decided here"
+        show(not any(self.disturbance) and (not self.plant or self.period > 0), forces)
+        terminal, plain = self.terminal, law.switching == "saturation" and not any(law.disturbance)
+        if terminal is None or not plain:
+            needed = "saturation, constant gains and a terminal set are needed"
+            raise Settlement("undecided", needed)
+        few = 2 * model.n + len(self.plant) <= MOST_STATES
+        show(few, f"more than {MOST_STATES} states and parameters that vary")
+        loop = self._loop(model, law, terminal)
         box = {x: self.starts.get(x, (Fraction(0), Fraction(0))) for x in model.states}
         wide = [x for x, (low, high) in box.items() if low < high]
         if wide and system(model, law).odd and all(low == -high for low, high in box.values()):
@@ -521,22 +425,20 @@ class ClosedLoop(Claim):
             return Decision("undecided", f"{method}: a tube is lost", witness, details)
         return Decision("proved", method, details=details)
 
-    def _loop(self, model: Model, law: Law, end: TerminalEllipsoid) -> Loop | str:
-        """The loop with its terminal set, or what is not shown of that."""
+    def _loop(self, model: Model, law: Law, end: TerminalEllipsoid) -> Loop:
+        """The loop with its terminal set."""
         if not self.period:
-            found, own = end.decide(model, law, 0), (model, law, end.W, end.radius, self.step)
-            return found.why if found.kind != "proved" else ContinuousLoop(*own)
+            found = decide(model, law, end)
+            show(found.kind == "proved", f"the terminal set: {found.why}")
+            return ContinuousLoop(model, law, end.W, end.radius, self.step)
         loop = HeldLoop(model, law, self.period, self.plant)
         loop.take(end.W, end.radius)
-        return loop.terminal()[0] or loop
+        why, _ = loop.terminal()
+        show(not why, f"the terminal set: {why}")
+        return loop
 
 
 # -- all of them ----------------------------------------------------------------------------------
-
-KINDS: Mapping[str, type[Claim]] = {
-    claim.kind: claim
-    for claim in (Stability, Nonsingular, Reaching, TerminalEllipsoid, SurfaceRegion, ClosedLoop)
-}
 
 
 def read_claim(data: Mapping[str, Any], model: Model) -> Claim:
@@ -561,6 +463,8 @@ def decide(model: Model, law: Law, claim: Claim, max_boxes: int = MOST_BOXES) ->
     """Decide a claim about a model and a law."""
     try:
         return claim.decide(model, law, max_boxes)
+    except Settlement as reason:
+        return Decision(*reason.args)
     except ArithmeticError as error:
         return Decision("undecided", f"at the target: {error}")
 

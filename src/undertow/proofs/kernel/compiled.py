@@ -97,8 +97,7 @@ def down(v):  # type: ignore[no-untyped-def]
 @_njit
 def up(v):  # type: ignore[no-untyped-def]
     """Move an upper end outward."""
-    w = v + (abs(v) * _STEP + _TINY)
-    return w if w == w else (-_MOST if v < 0.0 else v)
+    return -down(-v)
 
 
 @_njit
@@ -136,22 +135,20 @@ def add(x, y):  # type: ignore[no-untyped-def]
 
 
 @_njit
+def _real(v):  # type: ignore[no-untyped-def]
+    """A product of ends: 0 × unbounded is 0, for values are real."""
+    return v if v == v else 0.0
+
+
+@_njit
 def mul(x, y):  # type: ignore[no-untyped-def]
-    """Return x · y; 0 × unbounded is 0, for values are real, but 0 × undefined is not."""
+    """Return x · y; 0 × unbounded is 0, but 0 × undefined is not."""
     a, b, c, d = x.real, x.imag, y.real, y.imag
     if a != a or c != c:
         return _UNDEFINED
     if x == 0.0 or y == 0.0:
         return complex(0.0, 0.0)
-    p, q, r, s = a * c, a * d, b * c, b * d
-    if p != p:
-        p = 0.0
-    if q != q:
-        q = 0.0
-    if r != r:
-        r = 0.0
-    if s != s:
-        s = 0.0
+    p, q, r, s = _real(a * c), _real(a * d), _real(b * c), _real(b * d)
     return complex(down(min(p, q, r, s)), up(max(p, q, r, s)))
 
 
@@ -469,44 +466,23 @@ def jets(code, constants, box, rates, order, seeds):  # type: ignore[no-untyped-
 
 
 @_njit
-def _both(x, y):  # type: ignore[no-untyped-def]
-    """What two intervals that both hold have in common; the first where one is undefined."""
-    if x != x or y != y:
-        return x
-    return complex(max(x.real, y.real), min(x.imag, y.imag))
-
-
-@_njit
-def mean_values(whole, centre, box, m):  # type: ignore[no-untyped-def]
-    """Values over a box, by their intervals and by f(m) + ∂f (x − m), both of which hold: (O,).
-
-    ``whole`` are values and derivatives over the box (V,), (O, 1 + V), ``centre`` values at
-    doubles m inside, (O,).  Also: how much of each output is due to each variable, (O, V).
-    """
-    out, spread = np.empty_like(centre), np.empty((len(whole), len(box)))
-    for o in range(len(whole)):
-        mean = centre[o]
-        for i in range(len(box)):
-            slope, side = whole[o, 1 + i], complex(down(box[i].real - m[i]), up(box[i].imag - m[i]))
-            mean = add(mean, mul(slope, side))
-            spread[o, i] = magnitude(slope) * (box[i].imag - box[i].real)
-        out[o] = _both(whole[o, 0], mean)
-    return out, spread
-
-
-@_njit
-def along(whole, centre, C, xi, moved):  # type: ignore[no-untyped-def]
-    """Values at m + C ξ + moved (N, 1), by their intervals and their mean values, (O,).
+def along(whole, centre, C, xi):  # type: ignore[no-untyped-def]
+    """Values at m + C ξ, by their intervals and their mean values, both of which hold: (O,).
 
     ``whole`` are values and derivatives over a box that holds them, (O, 1 + N), ``centre``
     values at m, (O,).
     """
-    out, slope = np.empty_like(centre), np.ascontiguousarray(whole[:, 1:])
-    first, second = product(product(slope, points(C)), xi), product(slope, moved)
-    for o in range(len(whole)):
-        mean = add(add(centre[o], first[o, 0]), second[o, 0])
-        out[o] = _both(whole[o, 0], mean)
+    slopes = product(np.ascontiguousarray(whole[:, 1:]), points(C))
+    out = sums(centre, product(slopes, xi)[:, 0])
+    for o, x in enumerate(whole[:, 0]):
+        y = out[o]
+        out[o] = complex(max(x.real, y.real), min(x.imag, y.imag)) if x == x and y == y else x
     return out
+
+
+def mean_values(whole: Any, centre: Any, box: Any, m: Any) -> Any:
+    """Values over a box (N,), m inside, as :func:`along` has them, (O,)."""
+    return along(whole, centre, np.eye(len(m)), sums(box, points(-m))[:, None])
 
 
 # -- interval matrices ----------------------------------------------------------------------------
@@ -525,10 +501,25 @@ def product(A, B):  # type: ignore[no-untyped-def]
 
 @_njit
 def points(A):  # type: ignore[no-untyped-def]
-    """A matrix of doubles as intervals."""
+    """An array of doubles as intervals."""
+    return A * complex(1.0, 1.0)
+
+
+@_njit
+def sums(A, B):  # type: ignore[no-untyped-def]
+    """A + B, arrays of one shape."""
     out = np.empty(A.shape, np.complex128)
-    for at, value in np.ndenumerate(A):
-        out[at] = point(value)
+    for at, x in np.ndenumerate(A):
+        out[at] = add(x, B[at])
+    return out
+
+
+@_njit
+def multiples(A, y):  # type: ignore[no-untyped-def]
+    """A · y, an array and one interval."""
+    out = np.empty(A.shape, np.complex128)
+    for at, x in np.ndenumerate(A):
+        out[at] = mul(x, y)
     return out
 
 
@@ -536,29 +527,18 @@ def points(A):  # type: ignore[no-untyped-def]
 def inverse(A):  # type: ignore[no-untyped-def]
     """Enclose the inverse of every matrix in A (N, N); NaN where that is not shown.
 
-    With a double R near the inverse of the middle and ‖I − R A‖ ≤ e < 1 (largest row sum),
-    A⁻¹ = (I − E)⁻¹ R, and (I − E)⁻¹ − I is at most e/(1 − e) in each entry.
+    With a double R near the inverse of the middle and E = R A − I, ‖E‖ ≤ e < 1 (Frobenius),
+    A⁻¹ = (I + E)⁻¹ R, and (I + E)⁻¹ − I is at most e/(1 − e) in each entry.
     """
-    n = len(A)
-    near, none = 0.5 * (A.real + A.imag), np.full((n, n), _UNDEFINED)
+    near, none, one = middle(A), np.full(A.shape, _UNDEFINED), np.eye(len(A))
     if not np.isfinite(near).all() or np.linalg.det(near) == 0.0:
         return none
     R = points(np.linalg.inv(near))
-    E = product(R, A)
-    worst = 0.0
-    for i in range(n):
-        total = 0.0
-        for j in range(n):
-            total = up(total + magnitude(add(E[i, j], point(-1.0 if i == j else 0.0))))
-        worst = max(worst, total) if total == total else _INF
-    if not worst < 0.5:
+    e = norm(sums(product(R, A), points(-one)).ravel())
+    if not e < 0.5:
         return none
-    e = up(worst / down(1.0 - worst))
-    for i in range(n):
-        for j in range(n):
-            c = 1.0 if i == j else 0.0
-            E[i, j] = complex(down(c - e), up(c + e))
-    return product(E, R)
+    e = up(e / down(1.0 - e))
+    return product(sums(points(one), np.full(A.shape, complex(-e, e))), R)
 
 
 @_njit
@@ -568,6 +548,15 @@ def norm(row):  # type: ignore[no-untyped-def]
     for x in row:
         total = up(total + up(magnitude(x) * magnitude(x)))
     return up(math.sqrt(total)) if total == total else _INF
+
+
+@_njit
+def extents(rows, radius):  # type: ignore[no-untyped-def]
+    """Upper bounds of |row · z| over |z| ≤ radius, (K,), for interval rows (K, N)."""
+    out = np.empty(len(rows))
+    for i in range(len(rows)):
+        out[i] = up(norm(rows[i]) * radius)
+    return out
 
 
 @_njit
@@ -584,25 +573,31 @@ def dominance(S):  # type: ignore[no-untyped-def]
     return least
 
 
+@_njit
+def decrease(A, held):  # type: ignore[no-untyped-def]
+    """Dominance of −(A + Aᵀ), or of −(A + Aᵀ + AᵀA) if held: > 0 proves it positive definite.
+
+    A (N, N) is W J W⁻¹ with the derivative J of ẋ, or of x(T) − x(0).
+    """
+    S = sums(A, A.T)
+    if held:
+        S = sums(S, product(A.T, A))
+    scale = np.ones(len(A))  # of a congruence with a positive diagonal: any will do
+    for i in range(len(A)):
+        if middle(S[i, i]) < -1e-100:
+            scale[i] = 1.0 / math.sqrt(-middle(S[i, i]))
+    for (i, j), x in np.ndenumerate(S):
+        S[i, j] = mul(mul(neg(x), point(scale[i])), point(scale[j]))
+    return dominance(S)
+
+
 # -- one validated Taylor step --------------------------------------------------------------------
 
 
 @_njit
 def moved(X, rates, h):  # type: ignore[no-untyped-def]
     """X + h · rates, (N,)."""
-    out = np.empty_like(X)
-    for i in range(len(X)):
-        out[i] = add(X[i], mul(rates[i], h))
-    return out
-
-
-@_njit
-def hulled(m, C, xi):  # type: ignore[no-untyped-def]
-    """The box around m + C ξ, (N,)."""
-    X = product(points(C), xi)[:, 0].copy()
-    for i in range(len(m)):
-        X[i] = add(point(m[i]), X[i])
-    return X
+    return sums(X, multiples(rates, h))
 
 
 @_njit
@@ -614,78 +609,16 @@ def taylor_step(rest, centre, around, h, m, C, xi):  # type: ignore[no-untyped-d
     C (N, L) are doubles, ξ (L, 1) is a box, h an interval.  NaN where nothing is bounded.
     """
     n = len(m)
-    end, S, drift = rest.copy(), np.zeros((n, n), np.complex128), np.full((n, 1), _UNDEFINED)
+    end, slopes = rest.copy(), np.zeros((n, n), np.complex128)
     for k in range(centre.shape[1] - 1, -1, -1):  # Horner in h; the remainder comes first
-        for i in range(n):
-            end[i] = add(mul(end[i], h), centre[i, k])
-            for j in range(n):
-                S[i, j] = add(mul(S[i, j], h), around[i, k, 1 + j])
-    if not (np.isfinite(end).all() and np.isfinite(S).all()):
-        return drift
-    carried = product(S, points(C))
-    for i in range(n):
-        m[i] = middle(end[i])
-        drift[i, 0] = add(end[i], point(-m[i]))
-        for j in range(C.shape[1]):
-            C[i, j] = middle(carried[i, j])
-            part = mul(add(carried[i, j], point(-C[i, j])), xi[j, 0])
-            drift[i, 0] = add(drift[i, 0], part)
-    return drift
-
-
-# -- a terminal ellipsoid -------------------------------------------------------------------------
-
-
-@_njit
-def decrease(A, held):  # type: ignore[no-untyped-def]
-    """Dominance of −(A + Aᵀ), or of −(A + Aᵀ + AᵀA) if held: > 0 proves it positive definite.
-
-    A (N, N) is W J W⁻¹ with the derivative J of ẋ, or of x(T) − x(0).
-    """
-    size = len(A)
-    S, scale = np.empty_like(A), np.ones(size)
-    square = product(np.ascontiguousarray(A.T), A)
-    for i in range(size):
-        for j in range(size):
-            part = add(A[i, j], A[j, i])
-            S[i, j] = neg(add(part, square[i, j]) if held else part)
-        if middle(S[i, i]) > 1e-100:
-            scale[i] = 1.0 / math.sqrt(middle(S[i, i]))
-    for i in range(size):  # a congruence with a positive diagonal: any will do
-        for j in range(size):
-            S[i, j] = mul(mul(S[i, j], point(scale[i])), point(scale[j]))
-    return dominance(S)
-
-
-@_njit
-def ellipsoid(V, whole, centre, W, radius, C, layer, limits):  # type: ignore[no-untyped-def]
-    """Decide Lemma 5 for {|W x| ≤ radius}: what is not shown (0: all is), and a margin.
-
-    W (2n, 2n), V around its inverse and C (m, 2n) are intervals, radius is rounded up, layer
-    and limits down.  ``whole`` are values and derivatives over the box Q, (O, 1 + 2n),
-    ``centre`` values at 0, (O,), of q̈ (n), the demand (m), pivots (n) > 0, and what keeps its
-    sign: det B, det Γ.
-    """
-    size, m = len(W), len(layer)
-    n = size // 2
-    for i in range(n + m, len(whole)):
-        value = whole[i, 0]
-        if not (value.real > 0.0 or (value.imag < 0.0 and i >= n + m + n)):
-            return 2, -_INF
-    out, demand = product(C, V), product(whole[n : n + m, 1:], V)
-    for i in range(m):
-        if not up(norm(out[i]) * radius) <= layer[i]:
-            return 3, -_INF
-    for i in range(m):
-        if not up(magnitude(centre[n + i]) + up(norm(demand[i]) * radius)) <= limits[i]:
-            return 4, -_INF
-    F = np.zeros((size, size), np.complex128)
-    for i in range(n):
-        F[i, n + i] = point(1.0)
-        for j in range(size):
-            F[n + i, j] = whole[i, 1 + j]
-    margin = decrease(product(product(W, F), V), False)
-    return (0 if margin > 0.0 else 5), margin
+        end = moved(centre[:, k], end, h)
+        slopes = moved(around[:, k, 1:], slopes, h)
+    if not (np.isfinite(end).all() and np.isfinite(slopes).all()):
+        return np.full((n, 1), _UNDEFINED)
+    carried = product(slopes, points(C))
+    m[:], C[:] = middle(end), middle(carried)
+    off = product(sums(carried, points(-C)), xi)
+    return sums(sums(end, points(-m)).reshape(n, 1), off)
 
 
 # -- quadratic Taylor models ----------------------------------------------------------------------
@@ -824,14 +757,12 @@ def models(code, constants, outputs, low, high):  # type: ignore[no-untyped-def]
         T[V + i, E] = (constants[i].imag - constants[i].real) * _GROW + _LITTLE
     out = np.empty((boxes, len(outputs), E + 1))
     for start in range(0, boxes, LANES):
+        lanes = np.minimum(np.arange(start, start + LANES), boxes - 1)
+        left, right = low[:, lanes], high[:, lanes]
+        middle = 0.5 * left + 0.5 * right
+        radius = np.maximum(right - middle, middle - left) * _GROW
         for i in range(V):
-            for lane in range(LANES):
-                at = min(start + lane, boxes - 1)
-                a, b = low[i, at], high[i, at]
-                c = 0.5 * a + 0.5 * b
-                radius = max(b - c, c - a) * _GROW
-                T[i, 0, lane], T[i, 1 + i, lane], T[i, E + 1, lane] = c, radius, radius
-                T[i, E, lane] = _LITTLE
+            T[i, 0], T[i, 1 + i], T[i, E + 1], T[i, E] = middle[i], radius[i], radius[i], _LITTLE
         for line in range(len(code)):
             op, a, b = code[line]
             C = T[first + line]
@@ -852,30 +783,10 @@ def models(code, constants, outputs, low, high):  # type: ignore[no-untyped-def]
                     _times(T[a], T[-1], C, V)
             else:
                 C[:] = math.nan
-        for lane in range(min(LANES, boxes - start)):
-            for o in range(len(outputs)):
-                for k in range(E + 1):
-                    out[start + lane, o, k] = T[outputs[o], k, lane]
+        count = min(LANES, boxes - start)
+        for o in range(len(outputs)):
+            out[start : start + count, o] = T[outputs[o], : E + 1, :count].T
     return out
-
-
-@_njit
-def _ends(model, V):  # type: ignore[no-untyped-def]
-    """Enclose one model."""
-    total, low, high = abs(model[0]), model[0], model[0]
-    k = 1 + V
-    for i in range(V):
-        g, h = abs(model[1 + i]), model[k]
-        total += g + abs(h)
-        high += g * (g / (-4.0 * h)) if 2.0 * h < -g else g + h
-        low -= g * (g / (4.0 * h)) if 2.0 * h > g else g - h
-        for _ in range(i + 1, V):
-            k += 1
-            cross = abs(model[k])
-            total, high, low = total + cross, high + cross, low - cross
-        k += 1
-    rest = (model[k] + _ROUND * total) * _GROW + _LITTLE
-    return complex(low - rest, high + rest)
 
 
 @_njit
@@ -885,54 +796,46 @@ def ranges(models, V):  # type: ignore[no-untyped-def]
     out, spread = np.empty((boxes, count), np.complex128), np.zeros((boxes, count, V))
     for box in range(boxes):
         for o in range(count):
-            out[box, o] = _ends(models[box, o], V)
-            k = 1 + V
+            model, due, k = models[box, o], spread[box, o], 1 + V
+            total, low, high = abs(model[0]), model[0], model[0]
             for i in range(V):
-                spread[box, o, i] += abs(models[box, o, 1 + i])
-                for j in range(i, V):
-                    part = 0.5 * abs(models[box, o, k])
-                    spread[box, o, i] += part
-                    spread[box, o, j] += part
+                g, h = abs(model[1 + i]), model[k]
+                total += g + abs(h)
+                high += g * (g / (-4.0 * h)) if 2.0 * h < -g else g + h
+                low -= g * (g / (4.0 * h)) if 2.0 * h > g else g - h
+                due[i] += g + abs(h)
+                for j in range(i + 1, V):
                     k += 1
+                    cross = abs(model[k])
+                    total, high, low = total + cross, high + cross, low - cross
+                    due[i] += 0.5 * cross
+                    due[j] += 0.5 * cross
+                k += 1
+            rest = (model[k] + _ROUND * total) * _GROW + _LITTLE
+            out[box, o] = complex(low - rest, high + rest)
     return out, spread
 
 
-@_njit
-def excluded(models, V):  # type: ignore[no-untyped-def]
+@np.errstate(all="ignore")
+def excluded(models: Any, V: int) -> Any:
     """Boxes on which f ≥ 0, a ≤ 1 and b ≥ 1 are never true at once; models (B, 3, …) of f, a, b.
 
     Where they are, f + λ(1 − a) + μ(b − 1) ≥ 0 for all λ, μ ≥ 0, and so is (1 − a) + μ(b − 1).
     The factors that are tried take the slopes out; whatever they are, the bound decides.
     """
-    out = np.zeros(len(models), dtype=np.bool_)
-    trial, total = np.zeros(3), np.zeros(models.shape[2])
-    for box in range(len(models)):
-        f, a, b = models[box, :, 1 : 1 + V]
-        fa, fb, aa = (f * a).sum(), (f * b).sum(), (a * a).sum()
-        ab, bb = (a * b).sum(), (b * b).sum()
-        gap = aa * bb - ab * ab + _LITTLE
-        for kind in range(4):
-            trial[0], trial[1], trial[2] = 1.0, 0.0, 0.0
-            if kind == 0:
-                trial[1] = -max(fa / (aa + _LITTLE), 0.0)
-            elif kind == 1:
-                trial[2] = max(-fb / (bb + _LITTLE), 0.0)
-            elif kind == 2:
-                trial[1] = -max((fa * bb - fb * ab) / gap, 0.0)
-                trial[2] = max((fa * ab - fb * aa) / gap, 0.0)
-            else:
-                trial[0], trial[1], trial[2] = 0.0, -1.0, max(ab / (bb + _LITTLE), 0.0)
-            shift = -trial[1] - trial[2]
-            total[:] = 0.0
-            total[0], size = shift, abs(trial[1]) + abs(trial[2])
-            for o in range(3):
-                for k in range(models.shape[2] - 1):
-                    part = trial[o] * models[box, o, k]
-                    total[k] += part
-                    size += abs(part)
-                total[-1] += abs(trial[o]) * models[box, o, -1]
-            total[-1] = (total[-1] + _ROUND * size) * _GROW
-            if _ends(total, V).imag < 0.0:
-                out[box] = True
-                break
+    f, a, b = np.moveaxis(models[:, :, 1 : 1 + V], 1, 0)
+    fa, fb, aa, ab, bb = ((x * y).sum(axis=1) for x, y in ((f, a), (f, b), (a, a), (a, b), (b, b)))
+    gap, one, none = aa * bb - ab * ab + _LITTLE, np.ones(len(f)), np.zeros(len(f))
+    out = np.zeros(len(f), dtype=bool)
+    for weight, less, more in (  # of f, of 1 − a and of b − 1; the last two are to be ≥ 0
+        (one, np.maximum(fa / (aa + _LITTLE), 0.0), none),
+        (one, none, np.maximum(-fb / (bb + _LITTLE), 0.0)),
+        (one, *np.maximum(((fa * bb - fb * ab) / gap, (fa * ab - fb * aa) / gap), 0.0)),
+        (none, one, np.maximum(ab / (bb + _LITTLE), 0.0)),
+    ):
+        part = np.stack([weight, -less, more], axis=1)[:, :, None] * models
+        total, size = part.sum(axis=1), abs(part[:, :, :-1]).sum(axis=(1, 2)) + less + more
+        total[:, 0] += less - more
+        total[:, -1] = (abs(part[:, :, -1]).sum(axis=1) + _ROUND * size) * _GROW
+        out |= ranges(total[:, None], V)[0][:, 0].imag < 0.0
     return out

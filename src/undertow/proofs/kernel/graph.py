@@ -37,6 +37,9 @@ _RATIONAL: Mapping[str, Callable[..., Span]] = {
     "neg": operator.neg,
 }  # fmt: skip
 
+#: What changes nothing, as the second operand; of sums and products as the first one, too.
+_NEUTRAL = {"add": 0, "sub": 0, "mul": 1, "div": 1}
+
 _ORDERED: Mapping[str, Callable[..., Fraction]] = {"max": max, "min": min, "abs": abs}
 
 #: Binary digits of numerators and denominators: more are refused, before they eat all memory.
@@ -172,6 +175,14 @@ class Program:
         return np.asarray(jets[: len(rates)])
 
 
+def _operators(kind: str) -> tuple[Callable[[Node, Other], Node], Callable[[Node, Other], Node]]:
+    """An operation on a node and what follows it, and on a node and what precedes it."""
+    return (
+        lambda node, other: node.graph.make(kind, node, other),
+        lambda node, other: node.graph.make(kind, other, node),
+    )
+
+
 class Node:
     """An expression: operation and operands, its number if it is one, whether always defined."""
 
@@ -184,29 +195,10 @@ class Node:
         self.of, self.number, self.total = of, number, total
         graph.size += 1
 
-    def __add__(self, other: Other) -> Node:
-        return self.graph.make("add", self, other)
-
-    def __radd__(self, other: Other) -> Node:
-        return self.graph.make("add", other, self)
-
-    def __sub__(self, other: Other) -> Node:
-        return self.graph.make("sub", self, other)
-
-    def __rsub__(self, other: Other) -> Node:
-        return self.graph.make("sub", other, self)
-
-    def __mul__(self, other: Other) -> Node:
-        return self.graph.make("mul", self, other)
-
-    def __rmul__(self, other: Other) -> Node:
-        return self.graph.make("mul", other, self)
-
-    def __truediv__(self, other: Other) -> Node:
-        return self.graph.make("div", self, other)
-
-    def __rtruediv__(self, other: Other) -> Node:
-        return self.graph.make("div", other, self)
+    __add__, __radd__ = _operators("add")
+    __sub__, __rsub__ = _operators("sub")
+    __mul__, __rmul__ = _operators("mul")
+    __truediv__, __rtruediv__ = _operators("div")
 
     def __neg__(self) -> Node:
         return self.graph.make("neg", self)
@@ -261,25 +253,18 @@ class Graph:
         return self._new(kind, of, None, safe and all(k.total for k in of))
 
     def _simpler(self, kind: str, a: Node, b: Node) -> Node | None:
-        x, y = a.number, b.number
-        if kind == "add" and (x == 0 or y == 0):
-            return b if x == 0 else a
-        if kind == "sub" and y == 0:
+        x, y, neutral = a.number, b.number, _NEUTRAL.get(kind)
+        if kind == "mul" and ((x == 0 and b.total) or (y == 0 and a.total)):
+            return self.number(0)
+        if y is not None and y == neutral:
             return a
-        if kind == "sub" and x == 0:
+        if x is not None and x == neutral and kind in ("add", "mul"):
+            return b
+        if (kind == "sub" and x == 0) or (kind == "mul" and x == -1):
             return -b
-        if kind == "mul":
-            if (x == 0 and b.total) or (y == 0 and a.total):
-                return self.number(0)
-            if 1 in (x, y):
-                return b if x == 1 else a
-            if -1 in (x, y):
-                return -b if x == -1 else -a
-            if a is b:
-                return self.make("sqr", a)
-        if kind == "div" and y == 1:
-            return a
-        return None
+        if kind == "mul" and y == -1:
+            return -a
+        return self.make("sqr", a) if kind == "mul" and a is b else None
 
     # -- what is written in terms of it --------------------------------------------------------
 
@@ -370,12 +355,10 @@ class Graph:
         ``sides`` has an operand for a max or min: the one that it is known to be.
         """
         needed, place = depends(roots, sides), {k: k.index for k in self.inputs}
-        constants = list[complex]()
-        for k in needed:
-            if k.kind in ("number", "pi"):
-                place[k] = len(self.inputs) + len(constants)
-                constants.append(ops.PI if k.number is None else ops.hull(k.number))
-        base, lines = len(self.inputs) + len(constants), list[tuple[int, int, int]]()
+        numbers = [k for k in needed if k.kind in ("number", "pi")]
+        constants = [ops.PI if k.number is None else ops.hull(k.number) for k in numbers]
+        place |= {k: i for i, k in enumerate(numbers, len(self.inputs))}
+        base, lines = len(place), list[tuple[int, int, int]]()
         sines = dict[int, int]()  # sin and cos of one operand stand together
         for k in needed:
             here = base + len(lines)

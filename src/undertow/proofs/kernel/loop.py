@@ -14,7 +14,7 @@ import numpy as np
 
 from undertow.proofs.kernel import compiled as ops
 from undertow.proofs.kernel.graph import Array, FloatArray, Graph, Intervals, Program, Span
-from undertow.proofs.kernel.model import Law, Matrix, Model, System, input_limits, scale_of, system
+from undertow.proofs.kernel.model import Law, Matrix, Model, System, is_regular, scale_of, system
 from undertow.proofs.kernel.tube import Field, Held, Sampled, Tube
 
 #: Longest motion, s; steps of one tube, and of all before the checker gives up.
@@ -25,6 +25,41 @@ THINNEST, MOST_PLANTS = 2.0**-16, 512
 
 #: How far inside the layer, of its width, a set is cut at its edge: a part of one piece.
 EDGE = 2.0**-10
+
+#: What may not be shown of a terminal set.
+SINGULAR, IRREGULAR = "W is not shown to be invertible", "model and law are not shown to be regular"
+LAYER_LEFT, LIMIT_MET = "the boundary layer is left", "an input limit is met"
+
+
+def ellipsoid(
+    program: Program, fixed: Intervals, W: Intervals, radius: float, C: Intervals,
+    layer: FloatArray, limits: FloatArray, centre: Intervals | None = None,
+) -> tuple[str, float, FloatArray]:  # fmt: skip
+    """Decide Lemma 5 for {|W x| ≤ radius}: what is not shown, or "", margin, half-sides of Q.
+
+    W (2n, 2n) and C (m, 2n) are intervals, radius is rounded up, layer and limits down.
+    Outputs of the program are q̈ (n), the demand (m) and what is regular (n + 2); ``centre`` are
+    their values at x = 0, where they are known already.
+    """
+    V, size, m = ops.inverse(W), len(W), len(layer)
+    half, n = ops.extents(V, radius), size // 2
+    if not np.isfinite(half).all():
+        return SINGULAR, -np.inf, np.zeros(size)
+    if centre is None:
+        centre = program(np.concatenate([np.zeros(size), fixed]))[:, 0]
+    whole = program(np.concatenate([ops.between(-half, half), fixed]), size)
+    if np.isnan(whole).any() or not is_regular(whole[n + m :, 0], n):
+        return IRREGULAR, -np.inf, half
+    if not (ops.extents(ops.product(C, V), radius) <= layer).all():
+        return LAYER_LEFT, -np.inf, half
+    slopes = whole[:, 1:].copy()
+    most = ops.extents(ops.product(slopes[n : n + m], V), radius)
+    demand = ops.sums(centre[n : n + m], ops.between(-most, most))
+    if not ((-limits <= demand.real) & (demand.imag <= limits)).all():
+        return LIMIT_MET, -np.inf, half
+    F = np.vstack([ops.points(np.eye(n, size, n)), slopes[:n]])
+    margin = ops.decrease(ops.product(ops.product(W, F), V), False)
+    return "" if margin > 0.0 else "V̇ < 0 is not shown", margin, half
 
 
 @dataclass(frozen=True)
@@ -94,9 +129,8 @@ class Loop:
 
     def kept(self, stay: Intervals, fixed: Intervals) -> bool:
         """Whether model and law are regular on a box."""
-        values = self.regular(np.concatenate([stay, fixed]))[:, 0].reshape(-1, self.model.n + 2)
-        kept = (values.real > 0.0) | (values.imag < 0.0)
-        return bool(kept.all() and (values[:, :-2].real > 0.0).all())
+        values = self.regular(np.concatenate([stay, fixed]))[:, 0]
+        return all(is_regular(v, self.model.n) for v in values.reshape(-1, self.model.n + 2))
 
     def aim(self, graph: Graph, x: Array, W: Matrix, radius: Fraction) -> None:
         """Take {|W x| ≤ radius} as the set."""
@@ -209,11 +243,11 @@ class HeldLoop(Loop):
         if self.no_equilibrium:
             return self.no_equilibrium, -np.inf
         V, least = ops.inverse(self.W), np.inf
-        half = np.array([ops.up(ops.norm(row) * self.radius.imag) for row in V])
+        half = ops.extents(V, self.radius.imag)
         if not np.isfinite(half).all():
-            return "W is not shown to be invertible", -np.inf
+            return SINGULAR, -np.inf
         if not (half[self.size - self.model.m :] <= ops.hulls(self.law.layer).real).all():
-            return "the boundary layer is left", -np.inf
+            return LAYER_LEFT, -np.inf
         whole = ops.ends(self.plant)
         box, todo, tried = np.column_stack([-half, half]), [whole], 0
         while todo:
@@ -233,25 +267,23 @@ class HeldLoop(Loop):
         m, none, plant = self.model.m, np.zeros(self.model.m, dtype=complex), X[self.size :]
         middle = np.append(np.zeros(self.size), 0.5 * (plant.real + plant.imag))
         over, at = self.inside.expanded(X, middle, self.held.fixed())
-        L = ops.mean_values(over, at, X, middle)[0]
+        L = ops.mean_values(over, at, X, middle)
         return middle, Sampled(none, none, L[m:], at[m:], over[m:, 1:])
 
     def _contracts(self, V: Intervals, X: Intervals) -> tuple[str, float]:
         """Decide Lemma 11 for a part of the plants: X (N,) is a box around the set, and it."""
         size, (middle, law) = self.size, self.slopes(X)
         rows = ops.product(law.L.reshape(-1, len(X))[:, :size].copy(), V)
-        most = np.array([ops.up(ops.norm(row) * self.radius.imag) for row in rows])
-        if not (most <= input_limits(self.model)).all():
-            return "an input limit is met", -np.inf
+        most = ops.extents(rows, self.radius.imag)
+        if not (most <= self.model.limits).all():
+            return LIMIT_MET, -np.inf
         law = law._replace(u=ops.between(-most, most))
         found = self.held.derivative(X, middle, law, self.step)
         if found is None:
             return "motions over a period have no bounds", -np.inf
         if not self.kept(found[1], self.held.fixed()):
-            return "model and law are not shown to be regular", -np.inf
-        E = found[0][:size, :size].copy()
-        for i in range(size):
-            E[i, i] = ops.add(E[i, i], ops.point(-1.0))
+            return IRREGULAR, -np.inf
+        E = ops.sums(found[0][:size, :size].copy(), ops.points(-np.eye(size)))
         margin = ops.decrease(ops.product(ops.product(self.W, E), V), True)
         return ("" if margin > 0.0 else "|W z| is not shown to fall"), margin
 

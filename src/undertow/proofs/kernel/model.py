@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from undertow.proofs.kernel.compiled import hull, hulls
-from undertow.proofs.kernel.graph import Array, FloatArray, Graph, Intervals, Node, Span
+from undertow.proofs.kernel.graph import Array, FloatArray, Graph, Intervals, Node, Program, Span
 
 Matrix = tuple[tuple[Fraction, ...], ...]
 
@@ -68,6 +68,11 @@ class Model:
         names = [p.name for p in self.positions]
         return (*names, *(f"{name}_dot" for name in names))
 
+    @property
+    def limits(self) -> FloatArray:
+        """Lower bounds of the input limits, (m,), ∞ for none."""
+        return np.array([math.inf if i.value is None else hull(i.value).real for i in self.inputs])
+
     def lay(self, graph: Graph, leaves: Sequence[Node] | Array) -> tuple[Array, Array, Array]:
         """Lay M (n, n), f (n,) and B (m, m) on a graph: x and then p are these nodes."""
         n, at = self.n, list[Node]()
@@ -100,6 +105,12 @@ class Law:
     layer: tuple[Fraction, ...]
     switching: str
     disturbance: tuple[Fraction, ...]
+
+    @property
+    def rows(self) -> Intervals:
+        """C of s = C x, enclosed, (m, 2n)."""
+        blocks = self.lambda_a, self.lambda_u, self.alpha_a, self.alpha_u
+        return np.hstack([hulls(block) for block in blocks])
 
 
 # -- matrices of nodes, (…,) ----------------------------------------------------------------------
@@ -274,8 +285,8 @@ class System:
 
     @property
     def regular(self) -> list[Node]:
-        """Pivots of M, which are to be > 0, then det B and det Γ, which are not to be 0."""
-        return [*self.pivots, self.B_determinant, self.gamma_determinant]
+        """What :func:`is_regular` asks of: pivots of M (Lemma 2), then det B and det Γ."""
+        return [*self.uu[1], *self.ss[1], self.B_determinant, self.gamma_determinant]
 
     @property
     def odd(self) -> bool:
@@ -285,9 +296,12 @@ class System:
         return all((k >= len(even)) in parity for k, parity in enumerate(shown))
 
     @property
-    def pivots(self) -> list[Node]:
-        """Those of M with the unactuated block first: all > 0 iff M is positive definite."""
-        return [*self.uu[1], *self.ss[1]]
+    def thrust(self) -> Array:
+        """[α_a α_u] M⁻¹, (m, n): what a force adds to ṡ (Lemma 1)."""
+        m, number = self.model.m, self.graph.number
+        actuated = self.gamma @ solve(self.ss, identity(m, number))
+        rest = self.alpha_u - actuated @ self.M_au
+        return np.hstack([actuated, rest @ solve(self.uu, identity(self.model.n - m, number))])
 
     @cached_property
     def s(self) -> Array:
@@ -334,6 +348,12 @@ class System:
         demand = self.B_adjugate @ (self.S @ w - h) / self.B_determinant
         return [*w, *(y - self.X @ w)], demand
 
+    @cached_property
+    def within_layer(self) -> Program:
+        """q̈, the demand and what is regular, of the loop inside the layer."""
+        q_dd, demand = self.loop(self.push(layer=True))
+        return self.graph.program([*q_dd, *demand, *self.regular])
+
     def fixed(self) -> Intervals:
         """Enclosures of the parameters."""
         return np.asarray(hulls([p.value for p in self.model.parameters]))
@@ -344,10 +364,10 @@ class System:
         return [*([Span(0)] * (2 * self.model.n)), *values]
 
 
-def input_limits(model: Model) -> FloatArray:
-    """Lower bounds of the input limits, (m,), ∞ for none."""
-    ends = [math.inf if i.value is None else hull(i.value).real for i in model.inputs]
-    return np.array(ends)
+def is_regular(values: Intervals, n: int) -> bool:
+    """Whether enclosures of :attr:`System.regular` show it: n pivots > 0, determinants not 0."""
+    positive = values.real > 0.0
+    return bool(positive[:n].all() and (positive | (values.imag < 0.0)).all())
 
 
 @lru_cache(maxsize=64)

@@ -86,6 +86,19 @@ def interval(data: Any) -> tuple[Fraction, Fraction]:
     return low, high
 
 
+def box(data: Any, known: Mapping[str, Fraction | None]) -> dict[str, tuple[Fraction, Fraction]]:
+    """Read a box of known names, around their values where they have one."""
+    require(isinstance(data, dict), "a box: an object")
+    out = {}
+    for name, ends in data.items():
+        require(name in known, f"a box of {name[:64]!r}, which the model does not have there")
+        low, high = out[name] = interval(ends)
+        inside = known[name]
+        good = inside is None or low <= inside <= high
+        require(good, f"a box of {name!r} without its {float(inside or 0):g}")
+    return out
+
+
 def fields(data: Any, what: str, keys: Collection[str], more: Collection[str] = ()) -> Any:
     """Check that an object has these keys, and at most some more."""
     require(isinstance(data, dict), f"{what}: an object")

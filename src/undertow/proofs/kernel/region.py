@@ -9,20 +9,21 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from undertow.proofs.kernel import compiled as ops
-from undertow.proofs.kernel.bound import Goal, Settled, halved, settle
+from undertow.proofs.kernel.bound import TRIED, Bools, Goal, Point, Rule, Settled, branch, settle
 from undertow.proofs.kernel.graph import Array, FloatArray, Graph, Intervals, Node, Program, Span
 from undertow.proofs.kernel.model import Law, Matrix, Model, Sliding, identity, inverse
 
-#: Boxes that are looked at together, and points of them that are tried for a counterexample.
-CHUNK, TRIED = 4096, 16
+#: Boxes that are looked at together; the longest side of one that is not halved any more, and the
+#: part of the longest below which a side is not, each relative to the whole box.
+CHUNK, TINY, SLIM = 4096, 1e-7, 0.02
 
 
 @dataclass(frozen=True)
@@ -146,9 +147,10 @@ class Stage:
         y_dot, self.pivots = _motion(graph, model, law, y, p)
         c_dot = chart.total @ y_dot + chart.slope @ y * y_dot[0]
         value, guard, self.rate = chart.value(V, column, c_dot)
-        before = [] if inner is None else chart.value(inner, column)
         self.rates = list(y_dot)
-        nodes = [self.rate, value, *before[:1], guard, *before[1:], *self.pivots]
+        none = [graph.number(2), graph.number(0)]  # S_0 is empty
+        before, inside = none if inner is None else chart.value(inner, column)
+        nodes = [self.rate, value, before, guard, inside, *self.pivots]
         self.program, self.y = graph.program(nodes), graph.program(list(y))
         self.even = all(0 in p for p in graph.parities(nodes, size))
 
@@ -160,13 +162,16 @@ class Stage:
         if self.half is None:
             return Settled("undecided", "the guard reaches the pole", (), 0)
         side, ends = ops.hulls(self.sides).imag, ops.ends(self.plant)
-        core = np.zeros(self.size)
-        if self.inner is None:
-            found = self._core(0.25 * side, ends)
-            if found is None:
-                return Settled("undecided", "V̇ is not shown negative definite at 0", (), 0)
-            core = found
-        return self._branch(side, ends, core, max_boxes)
+        low, high = np.append(-side, ends[:, 0]), np.append(side, ends[:, 1])
+        unit = np.where(high > low, high - low, 1.0)
+        core = self._core(0.25 * side, ends) if self.inner is None else np.full(self.size, -1.0)
+        if core is None:
+            return Settled("undecided", "V̇ is not shown negative definite at 0", (), 0)
+        if self.even:  # half of the box will do
+            high[self.size - 1] = 0.0
+        rule = Rule(CHUNK, unit, TINY, SLIM, max_boxes)
+        found = branch(low, high, rule, partial(self._left, core), self._false)
+        return replace(found, point=self._named(found.point)) if found.point else found
 
     def _core(self, cube: FloatArray, ends: FloatArray) -> FloatArray | None:
         """A cube where M ≻ 0 and V̇ = ½ xᵀ H(ζ x) x with H ≺ 0, the plant in slices."""
@@ -190,77 +195,37 @@ class Stage:
             cube = cube / 1.6
         return None
 
-    def _false(self, a: FloatArray) -> str:
-        """What is false for certain at a point, if anything."""
-        values = self.program(ops.between(a, a))[:, 0]
-        count = 2 if self.inner is None else 3
-        outside = self.inner is None or values[2].real > 1.0
-        if values[1].imag <= 1.0 and values[count].imag <= 1.0:
-            if outside and values[0].real > 0.0:
-                return "V̇ < 0"
-            if (values[-len(self.pivots) :].imag <= 0.0).any():
-                return "M ≻ 0"
-        return ""
+    def _false(self, middle: FloatArray, tiny: Bools) -> tuple[str, Point] | None:
+        """What is false for certain at a point, (V, N), if anything."""
+        for at in [*range(min(len(tiny), TRIED)), *np.flatnonzero(tiny)[:1]]:
+            x = middle[:, at]
+            rate, value, before, guard, _, *pivots = self.program(ops.between(x, x))[:, 0]
+            if value.imag > 1.0 or guard.imag > 1.0:
+                continue
+            if before.real > 1.0 and rate.real > 0.0:
+                return "V̇ < 0", tuple(x.tolist())
+            if any(pivot.imag <= 0.0 for pivot in pivots):
+                return "M ≻ 0", tuple(x.tolist())
+        return None
 
-    def _done(
-        self, a: FloatArray, b: FloatArray, core: FloatArray
-    ) -> tuple[NDArray[np.bool_], FloatArray]:
-        """Boxes that are settled, and how much V̇ varies with each variable, (B, V)."""
-        V, n = len(a), len(self.pivots)
+    def _left(self, core: FloatArray, a: FloatArray, b: FloatArray) -> tuple[Bools, FloatArray]:
+        """Boxes that are not settled, (1, B), and how much V̇ varies with each variable, (V, B)."""
         program: Program = self.program
         models = ops.models(program.code, program.constants, program.outputs, a, b)
-        values, spread = ops.ranges(models, V)
-        low, high = values.real, values.imag
-        count = 2 if self.inner is None else 3  # then the guards
-        ring = models[:, :3].copy()
-        if self.inner is None:
-            ring[:, 2], ring[:, 2, 0] = 0.0, 1.0
-            far = np.maximum(abs(a), abs(b))[: self.size]
-            home = np.asarray((far <= core[:, None]).all(axis=0))
-            near = np.ones(a.shape[1], dtype=bool)
-        else:
-            near = high[:, 4] < 1.0
-            home = near & (high[:, 2] < 1.0)
-        falls = (high[:, 0] < 0.0) | (near & ops.excluded(ring, V))
-        inside = (high[:, count] < 1.0) & (home | (falls & (low[:, -n:] > 0.0).all(axis=1)))
-        return (low[:, 1] > 1.0) | (low[:, count] > 1.0) | inside, spread[:, 0]
+        values, spread = ops.ranges(models, len(a))
+        low, high = values.T.real, values.T.imag
+        outside, near, falls = (low[1] > 1.0) | (low[3] > 1.0), high[4] < 1.0, high[0] < 0.0
+        open_yet = near & ~(outside | falls)
+        falls[open_yet] = ops.excluded(models[open_yet, :3], len(a))
+        far = np.maximum(abs(a), abs(b))[: self.size]
+        home = (far <= core[:, None]).all(axis=0) | (near & (high[2] < 1.0))
+        inside = (high[3] < 1.0) & (home | (falls & (low[5:] > 0.0).all(axis=0)))
+        return ~(outside | inside)[None], spread[:, 0].T
 
-    def _branch(
-        self, side: FloatArray, ends: FloatArray, core: FloatArray, max_boxes: int
-    ) -> Settled:
-        start = np.append(-side, ends[:, 0])[:, None], np.append(side, ends[:, 1])[:, None]
-        low, high = start
-        if self.even:  # half of the box will do
-            high = high.copy()
-            high[self.size - 1] = 0.0
-        unit = start[1] - start[0]
-        unit[unit == 0.0] = 1.0
-        count = 0
-        while low.shape[1]:
-            a, b, low, high = low[:, -CHUNK:], high[:, -CHUNK:], low[:, :-CHUNK], high[:, :-CHUNK]
-            count += a.shape[1]
-            done, spread = self._done(np.ascontiguousarray(a), np.ascontiguousarray(b), core)
-            if done.all():
-                continue
-            a, b, spread = a[:, ~done], b[:, ~done], spread[~done].T
-            width, middle = (b - a) / unit, 0.5 * a + 0.5 * b
-            tiny = width.max(axis=0) < 1e-7
-            for at in [*range(min(len(tiny), TRIED)), *np.flatnonzero(tiny)[:1]]:
-                point = np.ascontiguousarray(middle[:, at])
-                if why := self._false(point):
-                    return Settled("refuted", why, self._named(point), count)
-            if tiny.any() or count > max_boxes:
-                point = np.ascontiguousarray(middle[:, int(tiny.argmax())])
-                why = "stuck in a tiny box" if tiny.any() else f"more than {max_boxes} boxes"
-                return Settled("undecided", why, self._named(point), count)
-            weight = np.where(np.isfinite(spread).all(axis=0), spread, width)
-            weight = np.where(width > 0.02 * width.max(axis=0), weight, 0.0)
-            low, high = halved(a, b, weight.argmax(axis=0), low, high)
-        return Settled("proved", "", (), count)
-
-    def _named(self, point: FloatArray) -> tuple[float, ...]:
-        y = self.y(ops.between(point, point))[:, 0]
-        return (*(0.5 * (y.real + y.imag)).tolist(), *point[self.size :].tolist())
+    def _named(self, point: Sequence[float]) -> Point:
+        x = np.array(point)
+        y = self.y(ops.between(x, x))[:, 0]
+        return (*(0.5 * (y.real + y.imag)).tolist(), *point[self.size :])
 
 
 def _negative_definite(H: Intervals) -> bool:

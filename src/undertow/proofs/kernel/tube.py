@@ -10,8 +10,9 @@ found, the step.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -39,6 +40,27 @@ HELD_ORDER, LONG_ORDER = 5, 8
 MOST_COLUMNS, KEPT_COLUMNS, FEW_COLUMNS = 300, 240, 8
 
 
+class Pieces:
+    """Nodes with max and min in them: where these change, and the programs of either side."""
+
+    def __init__(
+        self, graph: Graph, nodes: Sequence[Node], lower: Callable[[Sequence[Node], Sides], Program]
+    ) -> None:
+        self.corners = corners(nodes)
+        self.gaps = graph.program([k.of[0] - k.of[1] for k in self.corners])
+        #: What is made of the nodes where some corners, pairs with an operand, are that operand.
+        self.program = cache(lambda *sides: lower(nodes, dict(sides)))
+
+    def options(self, gaps: Intervals) -> list[list[tuple[Node, Node]]]:
+        """Return the operands that each corner may be, where differences of operands are gaps."""
+        out = []
+        for k, gap in zip(self.corners, gaps, strict=True):
+            larger, smaller = k.of if k.kind == "max" else k.of[::-1]
+            sure = [larger] if gap.real >= 0.0 else [smaller] if gap.imag <= 0.0 else k.of
+            out.append([(k, operand) for operand in sure])
+        return out
+
+
 class Field:
     """A right-hand side of the first inputs of a graph, and its analytic pieces.
 
@@ -46,20 +68,7 @@ class Field:
     """
 
     def __init__(self, graph: Graph, rates: Sequence[Node]) -> None:
-        self._graph, self._rates, self._pieces = graph, rates, dict[bytes, Program]()
-        self._corners = corners(rates)
-        self.whole = graph.program(rates)
-        self.gaps = graph.program([k.of[0] - k.of[1] for k in self._corners])
-
-    def piece(self, gaps: Intervals) -> tuple[Program, bool]:
-        """Return the rates where the gaps of corners lie in (K,), and whether all are decided."""
-        first, second = gaps.real >= 0.0, gaps.imag <= 0.0
-        key = first.tobytes() + second.tobytes()
-        if key not in self._pieces:
-            ends = zip(self._corners, first, second, strict=True)
-            sides = {k: k.of[int(a != (k.kind == "max"))] for k, a, b in ends if a or b}
-            self._pieces[key] = self._graph.program(self._rates, sides)
-        return self._pieces[key], bool((first | second).all())
+        self.whole, self.pieces = graph.program(rates), Pieces(graph, rates, graph.program)
 
     def advance(self, tube: Tube, h: float, order: int = ORDER) -> Intervals | None:
         """Move a set on by h, in shorter steps where one is not shown.
@@ -95,10 +104,13 @@ class Field:
             return None
         box = np.concatenate([stay, tube.fixed])
         way = ops.moved(np.zeros_like(X), self.whole(box)[:, 0], complex(0.0, h))[:, None]
-        gaps = self.gaps.expanded(stay, tube.m, tube.fixed)
-        program, decided = self.piece(ops.along(*gaps, tube.C, tube.xi, way))
-        if not decided and not short:
+        gaps = self.pieces.gaps.expanded(stay, tube.m, tube.fixed)
+        moved = np.hstack([tube.C, np.eye(n)]), np.concatenate([tube.xi, way])
+        options = self.pieces.options(ops.along(*gaps, *moved))
+        sure = [sides[0] for sides in options if len(sides) == 1]
+        if len(sure) < len(options) and not short:
             return None
+        program = self.pieces.program(*sure)
         rest = program.series(box, order)[:, order, 0]
         if np.isnan(rest).any():  # a corner is inside: the short formula, Clarke's derivatives
             order = 2
@@ -150,8 +162,7 @@ class Held:
         self.both = graph.program([*rates, *(c[i] for i in range(N) for c in columns)])
         self.flow, self.renewed = graph.program(rates), graph.program(law)
         self.start = ops.points(np.eye(N)).ravel()
-        self._corners, self._pieces = corners(law), dict[tuple[int, ...], Program]()
-        self.gaps = graph.program([k.of[0] - k.of[1] for k in self._corners])
+        self.pieces = Pieces(graph, law, self.by_states)
 
     def by_states(self, nodes: Collection[Node], sides: Sides = NOWHERE) -> Program:
         """Return nodes, and their derivatives by x, row by row."""
@@ -171,17 +182,10 @@ class Held:
         Where several pieces of the law may be met, derivatives are those of all, for a mean may be
         of several, and the same everywhere.
         """
-        none, options, slopes = self.fixed(), list[list[int]](), list[Intervals]()
-        gaps = ops.along(*self.gaps.expanded(tube.hull, tube.m, none), *tube.parts)
-        for gap, k in zip(gaps, self._corners, strict=True):
-            larger = int(k.kind == "max")  # where the gap is below 0
-            sure = [larger] if gap.imag <= 0.0 else [1 - larger] if gap.real >= 0.0 else [0, 1]
-            options.append(sure)
-        for piece in itertools.product(*options):
-            if piece not in self._pieces:
-                sides = {k: k.of[i] for k, i in zip(self._corners, piece, strict=True)}
-                self._pieces[piece] = self.by_states(self.law, sides)
-            own, at = self._pieces[piece].expanded(tube.hull, tube.m, none)
+        none, slopes = self.fixed(), list[Intervals]()
+        gaps = ops.along(*self.pieces.gaps.expanded(tube.hull, tube.m, none), *tube.parts)
+        for piece in itertools.product(*self.pieces.options(gaps)):
+            own, at = self.pieces.program(*piece).expanded(tube.hull, tube.m, none)
             slopes.append(ops.along(own, at, *tube.parts)[self.m :])
         every = np.array(slopes)
         L = ops.between(every.real.min(axis=0), every.imag.max(axis=0))
@@ -237,7 +241,7 @@ class Held:
         end = self.both.series(np.concatenate([stay, fixed]), order)[n:, order, 0].copy()
         whole, at = self._series(X, m, law, order)
         for k in reversed(range(order)):
-            own, _ = ops.mean_values(whole[n:, k].copy(), at[n:, k].copy(), X, m)
+            own = ops.mean_values(whole[n:, k].copy(), at[n:, k].copy(), X, m)
             end = ops.moved(own, end, h)
         return end.reshape(n, n), stay[:n]
 
@@ -288,15 +292,14 @@ class Tube:
         self.xi = np.concatenate([self.xi, [[ops.add(box[k], ops.point(-m[k]))]]])
 
     @property
-    def parts(self) -> tuple[FloatArray, Intervals, Intervals]:
-        """C and ξ, and no more: the set around m."""
-        return self.C, self.xi, np.zeros((len(self.m), 1), dtype=complex)
+    def parts(self) -> tuple[FloatArray, Intervals]:
+        """C and ξ: the set around m."""
+        return self.C, self.xi
 
     @property
-    def coarse(self) -> tuple[FloatArray, Intervals, Intervals]:
-        """A set of few columns around this one, in place of :attr:`parts`."""
-        C, xi = _folded(self.C, self.xi, FEW_COLUMNS)
-        return C, xi, np.zeros((len(self.m), 1), dtype=complex)
+    def coarse(self) -> tuple[FloatArray, Intervals]:
+        """C and ξ of few columns, of a set around this one."""
+        return _folded(self.C, self.xi, FEW_COLUMNS)
 
     def move(self, rest: Intervals, centre: Intervals, around: Intervals, h: complex) -> bool:
         """Replace the set by what a step makes of it, if that is bounded (Lemma 6)."""
@@ -308,7 +311,8 @@ class Tube:
         self.xi = np.concatenate([self.xi, added])
         if self.C.shape[1] > MOST_COLUMNS:
             self.C, self.xi = _folded(self.C, self.xi, KEPT_COLUMNS)
-        self.hull = ops.hulled(self.m, self.C, self.xi)
+        spread = ops.product(ops.points(self.C), self.xi)[:, 0]
+        self.hull = ops.sums(ops.points(self.m), spread)
         return True
 
 

@@ -220,8 +220,8 @@ def search_for(
     limits, centre = mechanism.input_limits, between(*at_target[:, 0].T)
 
     def margin(candidate: TerminalEllipsoid) -> float:
-        code, found, _ = prove(loop, numbers, rows, limits, candidate, centre)
-        return found if code == 0 else min(found, 0.0)
+        why, found, _ = prove(loop, numbers, rows, limits, candidate, centre)
+        return min(found, 0.0) if why else found
 
     return EllipsoidSearch.of(margin, A, *rows)
 
