@@ -514,10 +514,13 @@ def test_surface_words_of_several_inputs() -> None:
     surface = parse_surface(pair, text)
     np.testing.assert_array_equal(surface.lambda_a, [[-2, 0.5], [0, -3]])
     np.testing.assert_array_equal(surface.alpha_a, -np.eye(2))
-    with pytest.raises(InvalidInputError, match="equal length"):
+    with pytest.raises(InvalidInputError, match="not equally long"):
         parse_surface(pair, "lambda_a=-2,0.5;0 alpha_u=1;2 lambda_u=4;5")
     with pytest.raises(InvalidInputError, match="'lambda_a' twice"):
         parse_surface(pair, f"{text} lambda_a=-1,0;0,-1")
+    for wrong, size in (("alpha_u=1,2", "1×2, must be 2×1"), ("lambda_a=-2", "1×1, must be 2×2")):
+        with pytest.raises(InvalidInputError, match=f"{size}. Write for instance {wrong[:7]}"):
+            parse_surface(pair, f"{wrong} lambda_u=4;5")
 
 
 @pytest.mark.slow

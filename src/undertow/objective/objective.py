@@ -20,6 +20,7 @@ from undertow.base import (
     InvalidInputError,
     ModelError,
     UndertowError,
+    a_kind,
     check_fields,
     checked,
     error_text,
@@ -384,7 +385,7 @@ class Objective:
         if not callable(self.stage):
             raise InvalidInputError(
                 f"stage cost of '{self.name}'",
-                value=f"{self.stage!r}, a {type(self.stage).__name__}",
+                value=f"{self.stage!r}, {a_kind(self.stage)}",
                 limit="a function of the mechanism's names that returns an expression",
                 remedy="Write lambda v: v.inputs[0]**2, or lambda v: 1 for a constant",
             )

@@ -11,7 +11,7 @@ from typing import Any, Literal, Self, get_args
 
 import numpy as np
 
-from undertow.base import InvalidInputError, UndertowError, check_fields, one_of
+from undertow.base import InvalidInputError, UndertowError, a_kind, check_fields, one_of
 from undertow.cascade import Cascade, CascadeState, Legs, derate_actuator
 from undertow.cascade.swing_up import CatchRegion, SwingUpAndCatch, designed, hanging
 from undertow.estimators import Estimator, MakeEstimator
@@ -338,7 +338,7 @@ class Recipe:
         if not isinstance(made, Estimator) or not hasattr(made, "mechanism"):
             raise InvalidInputError(
                 "estimator of a run",
-                value=f"{made!r}, a {type(made).__name__}"[:80],
+                value=f"{made!r}, {a_kind(made)}"[:80],
                 limit="an undertow.estimators.Estimator that its own __init__ has begun",
                 remedy="Derive your own from it: a run asks more of it than reset and estimate",
             )
