@@ -390,8 +390,8 @@ def parse_surface(mechanism: Mechanism, text: str) -> Surface:
     if missing:
         raise InvalidInputError(
             "surface",
-            value=repr(text),
-            limit=f"complete, {', '.join(missing)} too",
+            value=f"{text!r}, with {', '.join(missing)} missing",
+            limit="complete",
             remedy=f"Write for instance --surface '{example}'",
         )
     return Surface(**blocks)
