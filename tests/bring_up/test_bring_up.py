@@ -30,8 +30,10 @@ from undertow.bring_up import (
     rubbing,
 )
 from undertow.bring_up.fit import Fit, correlated, counted, dwell, readings
+from undertow.bring_up.identify import Estimate, Identification
 from undertow.bring_up.motion import MotionRecord, Predictor
 from undertow.bring_up.wiring import estimate_wiring, push_response
+from undertow.bring_up.wizard import RigFinding
 from undertow.cli import app
 from undertow.mechanisms import LIBRARY
 from undertow.plants import (
@@ -48,6 +50,7 @@ from undertow.studies.rigs.bring_up import (
     coverage,
     coverage_table,
     deviations,
+    handed_on,
     rig_in_the_class,
 )
 
@@ -537,6 +540,29 @@ def test_the_wizard_meets_a_driver_that_fails(
     assert words in " ".join(result.output.split())
     assert ("moves nothing" in result.output) is False
     assert ("close() of the rig: got RuntimeError: busy" in result.output) is (name == "Clings")
+
+
+def test_an_input_that_moves_nothing_says_what_was_tried() -> None:
+    """Half of 15 V: friction of 60 times the rig's own bears that, and is a cause, too."""
+    found = wizard("friction=60", learn=False)
+    (dead,) = (f for f in found.wrong if f.part == "voltage")
+    assert dead.measured == "moves nothing with 7.5 V"
+    assert "dry friction" in dead.remedy
+
+
+def test_what_was_identified_is_handed_on_to_a_run() -> None:
+    """Parameters and delay as options; a gain is the driver's. Not before all is right."""
+    rig = ut.mechanisms.rotary_pendulum()
+    found = {"delay": 0.00348, "friction_phi": 5e-4, "a_e": 0.13236, "gain_voltage": 0.9}
+    estimates = {k: Estimate(k, "", "", v, 0.01 * v, 0.98 * v, 1.02 * v) for k, v in found.items()}
+    none = np.zeros(2)
+    identified = Identification(estimates, (), none, none, none, none, rig)
+    command, gain = handed_on("my arm.py:arm", "d.py:D", BringUp((), None, identified, None))
+    words = "undertow run 'my arm.py:arm' --rig d.py:D --set a_e=0.13236 --delay 0.0035"
+    assert command == f"Run it with what was found: {words}"
+    assert gain == "voltage comes out 0.9 times: divide by that in the driver"
+    wrong = RigFinding("delay", "the loop", "3.5 ms", "1.5 ms", "wrong")
+    assert handed_on("arm.py:arm", "d.py:D", BringUp((wrong,), None, identified, None)) == ()
 
 
 def test_hardware_is_asked_at_its_own_pace() -> None:

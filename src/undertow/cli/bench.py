@@ -65,7 +65,13 @@ def bench(
     from undertow.bring_up import bring_up, miswired, rest_state
     from undertow.bring_up.faults import rig_named
     from undertow.plants import RealisticRig
-    from undertow.studies.rigs.bring_up import files, findings_table, parameter_table, summary
+    from undertow.studies.rigs.bring_up import (
+        files,
+        findings_table,
+        handed_on,
+        parameter_table,
+        summary,
+    )
 
     if quick and delay is not None:
         raise InvalidInputError(
@@ -99,7 +105,8 @@ def bench(
         show(table)
         if found.identification is not None:
             show(Group("", parameter_table(found.identification)))
-        show(*summary(found), *written)
+        said = handed_on(name, rig, found) if in_a_file(rig) else ()
+        show(*summary(found), *said, *written)
         exit_unless(not found.wrong)
 
 
