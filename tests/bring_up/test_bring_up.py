@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import time
 from dataclasses import replace
 from functools import lru_cache
@@ -540,6 +541,48 @@ def test_the_wizard_meets_a_driver_that_fails(
     assert words in " ".join(result.output.split())
     assert ("moves nothing" in result.output) is False
     assert ("close() of the rig: got RuntimeError: busy" in result.output) is (name == "Clings")
+
+
+TERMINATED = """
+import signal
+import numpy as np
+from pathlib import Path
+from undertow import mechanisms
+from undertow.plants import IdealRig
+
+class Arm(IdealRig):
+    def __init__(self):
+        self.notes = [0.0]
+        m = mechanisms.rotary_pendulum()
+        super().__init__(m, m.state(phi=np.pi))
+
+    def write(self, u):
+        super().write(u)
+        self.notes.append(float(u[0]))
+        if u[0] and 0.0 == self.notes[-2]:
+            signal.raise_signal(signal.SIGTERM)
+
+    def close(self):
+        (Path(__file__).parent / "notes").write_text(repr(self.notes[-2:]))
+"""
+
+
+def test_a_signal_in_the_middle_of_a_push_leaves_the_inputs_at_zero(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What ends a process otherwise, as a shutdown does, left the last push on, for good."""
+    (tmp_path / "driver.py").write_text(TERMINATED)
+    monkeypatch.setattr("undertow.bring_up.faults.Paced", lambda rig: rig)  # needs no clock
+    words = ["bench", "rotary_pendulum", "--quick", "--rig", f"{tmp_path / 'driver.py'}:Arm"]
+    before = signal.signal(signal.SIGTERM, lambda *_: None)  # instead of the end of the tests
+    try:
+        result = CliRunner().invoke(app, words)
+        assert result.exit_code == 130, result.output
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    pushed, last = json.loads((tmp_path / "notes").read_text())
+    assert pushed != 0.0
+    assert last == 0.0
 
 
 def test_an_input_that_moves_nothing_says_what_was_tried() -> None:
