@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import time
 from dataclasses import replace
 from functools import lru_cache
@@ -30,8 +31,10 @@ from undertow.bring_up import (
     rubbing,
 )
 from undertow.bring_up.fit import Fit, correlated, counted, dwell, readings
+from undertow.bring_up.identify import Estimate, Identification
 from undertow.bring_up.motion import MotionRecord, Predictor
 from undertow.bring_up.wiring import estimate_wiring, push_response
+from undertow.bring_up.wizard import RigFinding
 from undertow.cli import app
 from undertow.mechanisms import LIBRARY
 from undertow.plants import (
@@ -48,6 +51,7 @@ from undertow.studies.rigs.bring_up import (
     coverage,
     coverage_table,
     deviations,
+    handed_on,
     rig_in_the_class,
 )
 
@@ -537,6 +541,71 @@ def test_the_wizard_meets_a_driver_that_fails(
     assert words in " ".join(result.output.split())
     assert ("moves nothing" in result.output) is False
     assert ("close() of the rig: got RuntimeError: busy" in result.output) is (name == "Clings")
+
+
+TERMINATED = """
+import signal
+import numpy as np
+from pathlib import Path
+from undertow import mechanisms
+from undertow.plants import IdealRig
+
+class Arm(IdealRig):
+    def __init__(self):
+        self.notes = [0.0]
+        m = mechanisms.rotary_pendulum()
+        super().__init__(m, m.state(phi=np.pi))
+
+    def write(self, u):
+        super().write(u)
+        self.notes.append(float(u[0]))
+        if u[0] and 0.0 == self.notes[-2]:
+            signal.raise_signal(signal.SIGTERM)
+
+    def close(self):
+        (Path(__file__).parent / "notes").write_text(repr(self.notes[-2:]))
+"""
+
+
+def test_a_signal_in_the_middle_of_a_push_leaves_the_inputs_at_zero(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What ends a process otherwise, as a shutdown does, left the last push on, for good."""
+    (tmp_path / "driver.py").write_text(TERMINATED)
+    monkeypatch.setattr("undertow.bring_up.faults.Paced", lambda rig: rig)  # needs no clock
+    words = ["bench", "rotary_pendulum", "--quick", "--rig", f"{tmp_path / 'driver.py'}:Arm"]
+    before = signal.signal(signal.SIGTERM, lambda *_: None)  # instead of the end of the tests
+    try:
+        result = CliRunner().invoke(app, words)
+        assert result.exit_code == 130, result.output
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    pushed, last = json.loads((tmp_path / "notes").read_text())
+    assert pushed != 0.0
+    assert last == 0.0
+
+
+def test_an_input_that_moves_nothing_says_what_was_tried() -> None:
+    """Half of 15 V: friction of 60 times the rig's own bears that, and is a cause, too."""
+    found = wizard("friction=60", learn=False)
+    (dead,) = (f for f in found.wrong if f.part == "voltage")
+    assert dead.measured == "moves nothing with 7.5 V"
+    assert "dry friction" in dead.remedy
+
+
+def test_what_was_identified_is_handed_on_to_a_run() -> None:
+    """Parameters and delay as options; a gain is the driver's. Not before all is right."""
+    rig = ut.mechanisms.rotary_pendulum()
+    found = {"delay": 0.00348, "friction_phi": 5e-4, "a_e": 0.13236, "gain_voltage": 0.9}
+    estimates = {k: Estimate(k, "", "", v, 0.01 * v, 0.98 * v, 1.02 * v) for k, v in found.items()}
+    none = np.zeros(2)
+    identified = Identification(estimates, (), none, none, none, none, rig)
+    command, gain = handed_on("my arm.py:arm", "d.py:D", BringUp((), None, identified, None))
+    words = "undertow run 'my arm.py:arm' --rig d.py:D --set a_e=0.13236 --delay 0.0035"
+    assert command == f"Run it with what was found: {words}"
+    assert gain == "voltage comes out 0.9 times: divide by that in the driver"
+    wrong = RigFinding("delay", "the loop", "3.5 ms", "1.5 ms", "wrong")
+    assert handed_on("arm.py:arm", "d.py:D", BringUp((wrong,), None, identified, None)) == ()
 
 
 def test_hardware_is_asked_at_its_own_pace() -> None:

@@ -181,6 +181,8 @@ def test_version_and_bare_call() -> None:
         (("run", CRANE, "--simulated", "--target", "x=2m"), "x = 2 m", "95 % of the travel"),
         (("simulate", RIG, "--control", "designed", "--accept", "local"), "local", "the cascade"),
         (("simulate", RIG, "--control", "one-time", "--belief", "usual"), "usual", "the cascade"),
+        (("simulate", RIG, "--control", "designed", "--schedule", ".1"), "0.1 s", "the cascade"),
+        (("simulate", RIG, "--schedule", "99"), "99 s", "0 s to 60 s"),
         (("animate", RIG, "--speed", "0"), "0.0", "> 0"),
         (("animate", RIG, "--longest", "-1"), "-1.0", "> 0"),
         (("derive", "robot.sdf"), "'.sdf'", ".urdf, .xml, .mjcf"),
@@ -213,6 +215,22 @@ def test_bad_input_is_refused_with_value_and_limit(
     assert err.count("\n") == 1
     assert f"got {value}" in err or value in err
     assert limit in err
+
+
+@pytest.mark.parametrize(
+    ("words", "belief"), [((), "exact"), (("--belief", "usual"), "usual")], ids=str
+)
+def test_a_schedule_goes_with_either_belief(
+    words: tuple[str, ...], belief: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in Python; the model is taken for the plant unless the command says otherwise."""
+
+    def asked(*_: object, **more: Any) -> None:
+        raise InvalidInputError(f"{more['belief']}, {more['freedom'].schedule:g} s")
+
+    monkeypatch.setattr("undertow.cli.control.Cascade", asked)
+    _, _, err = run("simulate", RIG, "--objective", "time", "--schedule", "0.1", *words)
+    assert err == f"error: {belief}, 0.1 s.\n"
 
 
 def test_a_target_on_the_command_line() -> None:
@@ -514,10 +532,13 @@ def test_surface_words_of_several_inputs() -> None:
     surface = parse_surface(pair, text)
     np.testing.assert_array_equal(surface.lambda_a, [[-2, 0.5], [0, -3]])
     np.testing.assert_array_equal(surface.alpha_a, -np.eye(2))
-    with pytest.raises(InvalidInputError, match="equal length"):
+    with pytest.raises(InvalidInputError, match="not equally long"):
         parse_surface(pair, "lambda_a=-2,0.5;0 alpha_u=1;2 lambda_u=4;5")
     with pytest.raises(InvalidInputError, match="'lambda_a' twice"):
         parse_surface(pair, f"{text} lambda_a=-1,0;0,-1")
+    for wrong, size in (("alpha_u=1,2", "1×2, must be 2×1"), ("lambda_a=-2", "1×1, must be 2×2")):
+        with pytest.raises(InvalidInputError, match=f"{size}. Write for instance {wrong[:7]}"):
+            parse_surface(pair, f"{wrong} lambda_u=4;5")
 
 
 @pytest.mark.slow

@@ -71,6 +71,8 @@ def test_a_run_is_logged_and_its_replay_is_identical(tmp_path: Path) -> None:
         (("run", "rotary_pendulum", "--start", "phi=40"), "'40'"),
         (("run", "rotary_pendulum", "--lead", "-1"), "-1"),
         (("run", "rotary_pendulum", "--rig", "real"), "FILE.py:NAME"),
+        (("run", "rotary_pendulum", "--delay", "0.002"), "on an ideal rig"),
+        (("run", "rotary_pendulum", "--rig", "realistic", "--delay", "-1"), "≥ 0"),
     ],
 )
 def test_bad_words_are_refused_in_one_line(words: tuple[str, ...], value: str) -> None:
@@ -158,6 +160,33 @@ def test_a_rig_of_ones_own_is_kept_by_another_process_unless_told_otherwise(
     assert "real-time priority" in out
     assert "memory locked" in out
     assert re.search(r"(granted|refused), ", out)
+
+
+REVERSED = """
+import numpy as np
+from undertow import mechanisms
+from undertow.plants import IdealRig, Measurement
+
+class Arm(IdealRig):
+    def __init__(self):
+        m = mechanisms.rotary_pendulum()
+        super().__init__(m, m.state(phi=0.2))
+
+    def read(self):
+        found = super().read()
+        return Measurement(found.t, -found.q)
+"""
+
+
+def test_who_has_reversed_encoders_is_shown_the_way_to_the_bench(tmp_path: Path) -> None:
+    """Lost at once, where the law is singular: the run knows the place, the bench the reason."""
+    (tmp_path / "arm.py").write_text(REVERSED)
+    place = f"{tmp_path / 'arm.py'}:Arm"
+    code, out, _ = run("run", "rotary_pendulum", "--rig", place, "--simulated", "--seconds", "2")
+    assert code == 4
+    said = " ".join(out.split())
+    assert re.search(r"thrown out: (the law is singular at phi = |phi is )-?\d", said)
+    assert f"undertow bench rotary_pendulum --rig {place} checks signs" in said
 
 
 LEAVES = """

@@ -204,6 +204,10 @@ REFUSALS: dict[str, tuple[Callable[[ut.Mechanism], object], str]] = {
         lambda rig: ut.Objective("odd", lambda v: v.states).stage_cost(rig),
         r"stage cost of 'odd'.*one expression",
     ),
+    "cost that no motion changes": (
+        lambda rig: ut.Objective("idle", lambda v: v.phi - v.phi).stage_cost(rig),
+        r"got 0, must be a cost that depends.*lambda v: 1 for least time",
+    ),
     "cost that can be negative": (
         lambda rig: ut.Objective("odd", lambda v: v.voltage * v.theta_dot).stage_cost(rig),
         r"stage cost of 'odd'.*-.*≥ 0",

@@ -111,6 +111,7 @@ def test_linearise(names: dict[str, Any]) -> None:
     pytest.importorskip("control")
     plant = does("9.", names)["plant"]
     system = plant.ss()
+    assert system.name == RIG.name
     assert system.state_labels == list(RIG.state_names)
     np.testing.assert_allclose(system.poles(), np.linalg.eigvals(plant.A))
 

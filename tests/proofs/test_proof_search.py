@@ -34,12 +34,26 @@ from undertow.proofs.region.lyapunov import (
     unit,
 )
 from undertow.proofs.region.motion import SurfaceMotion
-from undertow.proofs.search.basis import CLEARANCE, POLE_PART, Basis, linear_part, slowest_rate
+from undertow.proofs.search.basis import (
+    CLEARANCE,
+    FARTHEST,
+    POLE_PART,
+    Basis,
+    linear_part,
+    slowest_rate,
+)
 from undertow.proofs.search.chain import SearchBudget, _crossing, _expansion, _on_axis, grow
 from undertow.proofs.search.chart import natural_stretch, singular_distance_on_axis
 from undertow.proofs.search.linear_program import minimise_linear
-from undertow.proofs.search.quadratic import quadratic
-from undertow.proofs.search.region import HIGHEST, LEAP, TIGHT, _proved_chain, _tight_level
+from undertow.proofs.search.quadratic import Start, quadratic
+from undertow.proofs.search.region import (
+    HIGHEST,
+    LEAP,
+    TIGHT,
+    _proved_chain,
+    _tight_level,
+    search_region,
+)
 from undertow.proofs.search.terminal_ellipsoid import EllipsoidSearch
 from vector_field import VectorField
 
@@ -461,3 +475,24 @@ def test_slow_modes_have_room_where_alike_nothing_is_proved(slow_room: float, al
     slow, fast = axes(found)
     assert 0.3 / 1.01 <= slow <= 0.3
     assert fast == pytest.approx(slow if alike else slow / 10)  # by the root of the rates
+
+
+def carts_on_a_spring() -> SurfaceMotion:
+    """Two carts, one of them driven: a linear mechanism, whose motion converges from anywhere."""
+    x, y = ut.Coordinate("x", "m"), ut.Coordinate("y", "m")
+    v, w = x.velocity, y.velocity
+    pair = ut.Mechanism.from_energies(
+        "carts", [x, y], [ut.Input("force", "N", 10.0)],
+        kinetic=v**2 / 2 + (v + w) ** 2 / 4, potential=10 * y.symbol**2,
+        dissipation=0.1 * v**2 + 0.05 * w**2,
+    )  # fmt: skip
+    return SurfaceMotion(pair, ut.first_surface(pair))
+
+
+@pytest.mark.parametrize("start", ["far", "round", "balanced"])
+def test_the_region_of_a_linear_motion_ends_where_nobody_goes(start: Start) -> None:
+    """All sets of it are as good: one reached over 4.8e21 m."""
+    way = np.array([1.0, 0.0, 0.0])
+    chain = search_region(carts_on_a_spring(), way, programs=6, start=start)
+    reach = [extent(V, way) for V in chain]
+    assert 10.0 < reach[-1] < 1.3 * FARTHEST

@@ -376,7 +376,7 @@ def test_what_a_planner_says_that_is_no_proposal_is_named(controller: Controller
     odd = replace(RECIPE.cascade, planner=SimpleNamespace(propose=lambda *_, **__: 7))
     answer = respond(odd, request)
     assert not answer.admission.accepted
-    assert answer.proposal.message == "not a proposal but a int"
+    assert answer.proposal.message == "not a proposal but an int"
 
 
 def test_an_answer_is_computed_for_the_predicted_state_and_used_at_its_time(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -86,6 +87,16 @@ def test_a_recipe_with_a_target_is_data() -> None:
     assert again == recipe
     assert [begin for begin, _ in again.legs] == [0.0, 2.5]
     assert np.allclose(again.legs[1][1].state(9.0), CRANE.state(x=-0.3))
+
+
+def test_the_delay_that_a_bench_measures_is_the_estimators_and_the_rigs() -> None:
+    """Of the SRV02 in place of its usual 1.5 ms; through JSON values and back."""
+    late = Recipe.from_dict(Recipe(rig="realistic", delay=0.005).as_dict())
+    timing = late.make_rig().bench.timing
+    assert timing.input_delay + timing.measurement_delay == pytest.approx(0.005)
+    for recipe, periods in ((late, 5), (Recipe(rig="realistic"), 2)):
+        estimator: Any = recipe.make_estimator()
+        assert estimator._lead == periods
 
 
 def test_a_target_is_refused_before_a_controller_is_made(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -30,7 +30,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from undertow.base.errors import InvalidInputError, UndertowError, near
+from undertow.base.errors import InvalidInputError, UndertowError, a_kind, near
 
 #: What to give for a type, by its name.
 REMEDIES = {
@@ -372,7 +372,7 @@ def _refuse(of: Any, parameter: str | None, value: object, name: str = "") -> No
 def _shown(value: object) -> str:
     text = " ".join(repr(value).split())
     text = text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
-    return f"{text}, a {type(value).__name__}"
+    return f"{text}, {a_kind(value)}"
 
 
 def _members(hint: Any) -> list[Any]:

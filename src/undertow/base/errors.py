@@ -142,6 +142,16 @@ def error_text(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 
+def a_kind(value: object) -> str:
+    """Return the type of a value with its article.
+
+    >>> a_kind(3), a_kind("x")
+    ('an int', 'a str')
+    """
+    name = type(value).__name__
+    return f"an {name}" if name[0].lower() in "aeiou" else f"a {name}"
+
+
 def near(name: str, names: Iterable[str]) -> str:
     """Return "Did you mean …?" with the names that are like a wrong one; nothing where none is.
 

@@ -295,11 +295,15 @@ class _Wizard:
         for index, (kind, name, factor, what) in enumerate(parts):
             j = index - self.belief.m
             if factor == 0.0:
-                verb = "moves nothing" if kind == "input" else "does not move"
+                verb = "does not move"
+                if j < 0:
+                    channel = self.belief.inputs[index]
+                    tried = self.share[index] * channel.limit
+                    verb = f"moves nothing with {tried:.3g} {channel.unit}".rstrip()
                 self._add(
                     kind, name, verb, "moves", False,
                     f"Look at cable, supply and enable of the {what}, and for what holds the joint "
-                    "fast",
+                    "fast, dry friction too",
                 )  # fmt: skip
                 continue
             if j >= 0 and not reached[j]:

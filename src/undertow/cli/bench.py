@@ -65,7 +65,14 @@ def bench(
     from undertow.bring_up import bring_up, miswired, rest_state
     from undertow.bring_up.faults import rig_named
     from undertow.plants import RealisticRig
-    from undertow.studies.rigs.bring_up import files, findings_table, parameter_table, summary
+    from undertow.runtime.processes import signals_handled
+    from undertow.studies.rigs.bring_up import (
+        files,
+        findings_table,
+        handed_on,
+        parameter_table,
+        summary,
+    )
 
     if quick and delay is not None:
         raise InvalidInputError(
@@ -81,7 +88,8 @@ def bench(
     plant = rig_named(rig, belief, mechanism_named(name), rest, faults, seed)
     if delay is None and isinstance(plant, RealisticRig):
         delay = plant.bench.timing.input_delay + plant.bench.timing.measurement_delay
-    with _closed(plant):  # after what was found is shown: that may fail
+    # Closed after what was found is shown: that may fail.
+    with signals_handled(_interrupt), _closed(plant):
         if in_a_file(rig):
             ready = f"Ready. Let {name} come to rest, hands off, and press Enter."
             exit_unless(enter_pressed(ready))
@@ -99,8 +107,14 @@ def bench(
         show(table)
         if found.identification is not None:
             show(Group("", parameter_table(found.identification)))
-        show(*summary(found), *written)
+        said = handed_on(name, rig, found) if in_a_file(rig) else ()
+        show(*summary(found), *said, *written)
         exit_unless(not found.wrong)
+
+
+def _interrupt(_number: int, _frame: object) -> None:
+    """Let whatever asks for a stop be Ctrl-C: the inputs go to zero, and the rig is closed."""
+    raise KeyboardInterrupt
 
 
 @contextmanager

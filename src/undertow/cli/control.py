@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from undertow.base import InvalidInputError
+from undertow.base import InvalidInputError, between
 from undertow.cascade import Cascade, Gate
 from undertow.cli import options
 from undertow.cli.parsing import aimed, parse_surface, parse_target, parse_task, parse_values
@@ -74,12 +74,12 @@ def simulate(
         local: stability near the target. Repeatable. Default: none.
     known
         What the cascade takes for known. usual: parameters within their tolerances, learnt as it
-        goes. exact: the model, as in the paper. Default: usual; with --accept, whose evidence is of
-        one model, exact.
+        goes. exact: the model, as in the paper. Default: usual; exact with --accept, whose evidence
+        is of one model, and with --schedule.
     schedule
         Surfaces one after another with free reaching laws; for least time each for so long at most,
-        s, following the earliest motion over all inputs. The model is taken for the plant. 0.1, the
-        period, is usual. 0: one surface at a time.
+        s, following the earliest motion over all inputs. 0.1, the period, is usual. 0: one surface
+        at a time.
     out
         Folder for motion.csv, motion.png and manifest.json.
     """
@@ -102,21 +102,20 @@ def simulate(
             limit="cascade, which follows targets",
             remedy="Leave one of them out",
         )
-    for what, value in (("--accept", accept), ("--belief", known)):
-        if value is not None and steering != "cascade":
+    of_cascade = {
+        "--accept": ", ".join(accept or ()),
+        "--belief": known,
+        "--schedule": f"{schedule:g} s" if schedule else "",
+    }
+    for what, value in of_cascade.items():
+        if value and steering != "cascade":
             raise InvalidInputError(
                 what,
-                value=f"{value if isinstance(value, str) else ', '.join(value)}, with one surface",
+                value=f"{value}, with one surface",
                 limit="the cascade, which decides by it",
                 remedy="Leave it out, or --control and --surface",
             )
-    if schedule and (steering != "cascade" or known == "usual"):
-        raise InvalidInputError(
-            "--schedule",
-            value=f"{schedule:g} s, --control {steering}",
-            limit="the cascade, with a model that is taken for the plant",
-            remedy="Leave --control, --surface and --belief out",
-        )
+    between("--schedule", schedule, 0.0, horizon, "s", "0.1, the period, is usual")
     if steering == "cascade":
         gate = default_gate() if accept is None else _evidence_gate(accept)
         known = known or ("exact" if accept or schedule else "usual")

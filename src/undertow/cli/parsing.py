@@ -358,27 +358,40 @@ def parse_surface(mechanism: Mechanism, text: str) -> Surface:
     """Read a surface from its blocks; α_a is −I where it is not given.
 
     ``"lambda_a=-0.5 alpha_u=5 lambda_u=10"``; entries of a row are joined by commas, rows by
-    semicolons.
+    semicolons. A block of another size than the mechanism's is refused, with one that has it.
     """
     blocks: dict[str, FloatArray] = {"alpha_a": -np.eye(mechanism.m)}
-    names = ("alpha_a", "lambda_a", "alpha_u", "lambda_u")
-    example = "lambda_a=-0.5 alpha_u=5 lambda_u=10"
+    driven, free = mechanism.m, mechanism.n - mechanism.m
+    sizes = {"alpha_a": driven, "lambda_a": driven, "alpha_u": free, "lambda_u": free}
+    # Blocks of the right size and no more than that: undertow.first_surface designs good ones.
+    sample = {
+        name: ";".join(",".join(f"{v:g}" for v in row) for row in 0 - np.eye(driven, columns))
+        for name, columns in sizes.items()
+    }
+    example = " ".join(f"{name}={block}" for name, block in sample.items() if name != "alpha_a")
     for name, value in _pairs(text.split(), example).items():
-        one_of("surface block", name, names)
+        one_of("surface block", name, sizes)
         rows = [
             [_number(v, f"surface block {name}") for v in r.split(",")] for r in value.split(";")
         ]
-        if len({len(row) for row in rows}) != 1:
+        lengths = {len(row) for row in rows}
+        if len(rows) != driven or lengths != {sizes[name]}:
+            same = len(lengths) == 1
+            here = f"{len(rows)}×{lengths.pop()}" if same else "rows that are not equally long"
             raise InvalidInputError(
-                f"surface block {name}", value=repr(value), limit="rows of equal length"
+                f"surface block {name} for '{mechanism.name}'",
+                value=f"{value!r}, {here}",
+                limit=f"{driven}×{sizes[name]}",
+                remedy=f"Write for instance {name}={sample[name]}: a row for each driven "
+                f"coordinate, an entry for each {'driven' if name.endswith('_a') else 'free'} one",
             )
         blocks[name] = np.array(rows)
-    missing = [name for name in names if name not in blocks]
+    missing = [name for name in sizes if name not in blocks]
     if missing:
         raise InvalidInputError(
             "surface",
-            value=repr(text),
-            limit=f"complete; {', '.join(missing)} is missing",
+            value=f"{text!r}, with {', '.join(missing)} missing",
+            limit="complete",
             remedy=f"Write for instance --surface '{example}'",
         )
     return Surface(**blocks)

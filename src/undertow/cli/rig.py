@@ -70,6 +70,7 @@ def run(
     setting: options.Settings = None,
     known: Annotated[Literal["usual", "exact"], typer.Option("--belief")] = "usual",
     period: float = 0.001,
+    delay: float | None = None,
     lead: float = 0.1,
     worker: Literal["process", "thread"] = "process",
     lockstep: bool = True,
@@ -106,6 +107,9 @@ def run(
         runs. exact: the model.
     period
         Period of the fast loop, s.
+    delay
+        From a write to its effect in a reading, s, as undertow bench measures it; of a realistic
+        rig and your own. Default: that of a usual bench, 1 ms; of the SRV02 1.5 ms.
     lead
         Shortest time from a request to the optimiser until its answer is applied, s; it is
         increased when answers arrive late. A short one keeps the optimiser busy.
@@ -145,6 +149,7 @@ def run(
         rig="realistic" if rig == "realistic" or in_a_file(rig) else "ideal",
         seed=seed,
         period=period,
+        delay=delay,
         seconds=float("inf") if simulated else max(0.01, 0.3 * lead),
         settings=Settings(lead_time=lead),
     )
@@ -213,6 +218,9 @@ def run(
                 show(f"Earlier log moved to {written.earlier}")
         verdict = report.verdict  # with the log closed
         show(f"Verdict: {verdict}.")
+        if verdict.ending == "lost" and in_a_file(rig):
+            words = shlex.join(["undertow", "bench", name, "--rig", rig])
+            show(f"If it never held: {words} checks signs, scales and delay, from rest.")
     exit_unless(not verdict.exit_code, verdict.exit_code)
 
 

@@ -22,7 +22,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from undertow.base import REMEDIES, InvalidInputError, SingularSurfaceError, check_fields
+from undertow.base import REMEDIES, InvalidInputError, SingularSurfaceError, a_kind, check_fields
 from undertow.law.surface import LawLayout, ReachingLaw, Surface, SurfaceBlocks, Switching
 from undertow.models import TIME, FloatArray, Mechanism, Partition
 from undertow.symbolic import Tape, compile_numpy
@@ -332,7 +332,7 @@ def check_surface_shape(mechanism: Mechanism, surface: Surface) -> None:
     if not isinstance(surface, Surface):
         raise InvalidInputError(
             f"surface for '{mechanism.name}'",
-            value=f"{surface!r}, a {type(surface).__name__}",
+            value=f"{surface!r}, {a_kind(surface)}",
             limit="an undertow.Surface",
             remedy=REMEDIES["Surface"],
         )

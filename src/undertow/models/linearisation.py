@@ -33,7 +33,8 @@ UNCONTROLLABLE = 1e-9
 class Linearisation:
     """``M q̈ = F q + D q̇ + (B u, 0)`` at the target, numbers; u from the input that holds it.
 
-    ``M, F, D`` are (n, n), ``B`` (m, m); ``states`` and ``inputs`` are names, in the order of A.
+    ``M, F, D`` are (n, n), ``B`` (m, m); ``states`` and ``inputs`` are names, in the order of
+    A, and ``name`` is the mechanism's.
     """
 
     M: FloatArray
@@ -42,6 +43,7 @@ class Linearisation:
     B: FloatArray
     states: tuple[str, ...]
     inputs: tuple[str, ...]
+    name: str = ""
 
     def __repr__(self) -> str:
         """Show its states, its inputs and the eigenvalues of A."""
@@ -85,6 +87,7 @@ class Linearisation:
             states=self.states,
             inputs=self.inputs,
             outputs=self.states,
+            name=self.name.replace(".", "_") or None,  # python-control takes no dots
         )
 
 
@@ -128,6 +131,7 @@ def linearise(mechanism: Mechanism) -> Linearisation:
         B=_gain(mechanism, mechanism.parameter_values[None])[0],
         states=mechanism.state_names,
         inputs=tuple(i.name for i in mechanism.inputs),
+        name=mechanism.name,
     )
 
 

@@ -24,6 +24,7 @@ from undertow.base import (
     InvalidInputError,
     ModelError,
     ReadOnly,
+    a_kind,
     check_fields,
     checked,
     floats,
@@ -882,7 +883,7 @@ def matrix_of(what: str, value: object) -> sp.ImmutableDenseMatrix:
     except (TypeError, ValueError, NotImplementedError) as error:
         raise ModelError(
             what,
-            value=f"{value!r}, a {type(value).__name__}",
+            value=f"{value!r}, {a_kind(value)}",
             limit="a matrix of SymPy expressions",
             remedy="Write sympy.Matrix([[...], [...]])",
         ) from error

@@ -15,7 +15,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike, NDArray
 
-from undertow.base import InvalidInputError, one_of, positive
+from undertow.base import InvalidInputError, a_kind, one_of, positive
 
 FloatArray = NDArray[np.float64]
 
@@ -110,7 +110,7 @@ def number_of(what: str, value: object, *, limit: str = "a number", remedy: str 
             return float(value)
     raise InvalidInputError(
         what,
-        value=f"{value!r}, a {type(value).__name__}",
+        value=f"{value!r}, {a_kind(value)}",
         limit=limit,
         remedy=remedy or "Give a number in SI units: undertow.deg(10) for an angle of 10°",
     )

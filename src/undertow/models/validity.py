@@ -13,7 +13,7 @@ from sympy.core.function import Application, AppliedUndef
 from sympy.core.relational import Relational
 from sympy.logic.boolalg import Boolean
 
-from undertow.base import REMEDIES, InvalidInputError, ModelError, near
+from undertow.base import REMEDIES, InvalidInputError, ModelError, a_kind, near
 from undertow.models.quantities import (
     TIME,
     Coordinate,
@@ -125,7 +125,7 @@ def by_names(what: str, values: Mapping[str, T]) -> dict[str, T]:
     if odd or repeated:
         raise InvalidInputError(
             what,
-            value=f"{odd[0]!r}, a {type(odd[0]).__name__}" if odd else repeated,
+            value=f"{odd[0]!r}, {a_kind(odd[0])}" if odd else repeated,
             limit="names as text, each once",
             remedy="Write coordinate.name for a coordinate" if odd else "Keep one",
         )
@@ -157,7 +157,7 @@ def check_parts(
         if wrong:
             raise InvalidInputError(
                 f"{what} of '{owner}'",
-                value=f"{wrong[0]!r}, a {type(wrong[0]).__name__}",
+                value=f"{wrong[0]!r}, {a_kind(wrong[0])}",
                 limit=f"a sequence of undertow.{kind.__name__}",
                 remedy=REMEDIES[kind.__name__],
             )
@@ -201,7 +201,7 @@ def expression_of(what: str, value: object) -> sp.Expr:
     if not isinstance(expression, sp.Expr) or isinstance(expression, sp.MatrixBase):
         raise ModelError(
             what,
-            value=f"{shortened(value)}, a {type(value).__name__}",
+            value=f"{shortened(value)}, {a_kind(value)}",
             limit="a SymPy expression, or a number",
             remedy="Build it of coordinate.symbol, coordinate.velocity and parameter.symbol",
         )

@@ -20,6 +20,7 @@ from undertow.base import (
     InvalidInputError,
     ModelError,
     UndertowError,
+    a_kind,
     check_fields,
     checked,
     error_text,
@@ -384,7 +385,7 @@ class Objective:
         if not callable(self.stage):
             raise InvalidInputError(
                 f"stage cost of '{self.name}'",
-                value=f"{self.stage!r}, a {type(self.stage).__name__}",
+                value=f"{self.stage!r}, {a_kind(self.stage)}",
                 limit="a function of the mechanism's names that returns an expression",
                 remedy="Write lambda v: v.inputs[0]**2, or lambda v: 1 for a constant",
             )
@@ -619,11 +620,19 @@ class Objective:
         Raises
         ------
         InvalidInputError
-            For unknown names, and where Φ is negative or no number at the target or at one of
-            255 random states and inputs.
+            For unknown names, for Φ = 0, and where Φ is negative or no number at the target or at
+            one of 255 random states and inputs.
         """
         what = f"stage cost of '{self.name}'"
         stage = self._expression(mechanism, what, self.stage)
+        if stage.is_zero:
+            raise InvalidInputError(
+                what,
+                value="0",
+                limit="a cost that depends on the motion",
+                remedy="Write lambda v: 1 for least time, lambda v: v.inputs[0]**2 for least "
+                "energy",
+            )
         lowest = _lowest(mechanism, stage)
         if not lowest >= 0:
             raise InvalidInputError(

@@ -13,7 +13,14 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import ArtefactError, InvalidInputError, UndertowError, error_text, raised_at
+from undertow.base import (
+    ArtefactError,
+    InvalidInputError,
+    UndertowError,
+    a_kind,
+    error_text,
+    raised_at,
+)
 from undertow.models import FloatArray, Mechanism
 from undertow.models.importers.python_file import object_from_file
 
@@ -255,7 +262,7 @@ def check_rig(rig: Rig, mechanism: Mechanism, name: str = "rig of one's own") ->
         lacking.append("period > 0, s")
     if lacking:
         raise InvalidInputError(
-            f"'{name}', a {type(rig).__name__}",
+            f"'{name}', {a_kind(rig)}",
             value=f"without {', '.join(lacking)}",
             limit="read(), write(u), close() and a period",
             remedy="See undertow.plants.Rig and examples/serial_rig.py",

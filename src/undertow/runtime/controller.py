@@ -447,7 +447,11 @@ class Controller:
         norm = float(np.linalg.norm(self.wrapped))
         if not norm < self.settings.max_state_norm:
             return f"‖x‖ = {norm:.3g}, past {self.settings.max_state_norm:g}"
-        return "the law is singular here, (37)"
+        where = ", ".join(
+            f"{c.name} = {value:.3g}"
+            for c, value in zip(coordinates, self.wrapped[m:], strict=False)
+        )
+        return f"the law is singular at {where}, (37)"
 
     def _proceed(self, t: float) -> None:
         """Go on to the surface of a schedule that is in force at the time t."""

@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from undertow.base import InvalidInputError, checked, error_text
+from undertow.base import InvalidInputError, a_kind, checked, error_text
 from undertow.cascade import Legs
 from undertow.law import SetPoints
 from undertow.models import FloatArray, invariant_coordinates
@@ -435,7 +435,7 @@ class Runtime:
         if answer is None or is_answer(answer):
             return answer
         self.report.invalid_answers += 1
-        self._log_event("optimiser", f"no whole answer, a {type(answer).__name__}")
+        self._log_event("optimiser", f"no whole answer, {a_kind(answer)}")
         return None
 
     def _write(self, u: FloatArray) -> str:

@@ -11,7 +11,7 @@ from typing import Any, Literal, Self, get_args
 
 import numpy as np
 
-from undertow.base import InvalidInputError, UndertowError, check_fields, one_of
+from undertow.base import InvalidInputError, UndertowError, a_kind, check_fields, one_of, positive
 from undertow.cascade import Cascade, CascadeState, Legs, derate_actuator
 from undertow.cascade.swing_up import CatchRegion, SwingUpAndCatch, designed, hanging
 from undertow.estimators import Estimator, MakeEstimator
@@ -84,6 +84,9 @@ class Recipe:
         Budget of a re-optimisation; without ``seconds`` it depends on the seed alone.
     period
         Of the fast loop, s.
+    delay
+        From a write to its effect in a reading, s, as ``undertow bench`` measures it: the estimator
+        reckons with it, and a realistic rig has it.  By default the bench's own.
     swing_up
         Begin hanging at rest, where no other start is given, and swing up.
     target
@@ -122,6 +125,7 @@ class Recipe:
     evaluations: int = 1024
     seconds: float = math.inf
     period: float = 0.001
+    delay: float | None = None
     swing_up: bool = False
     target: tuple[tuple[float, Mapping[str, float]], ...] | Reference = ()
     duration: float = 60.0
@@ -145,6 +149,15 @@ class Recipe:
             one_of("objective of a run", self.objective, get_args(Goal))
         one_of("rig of a run", self.rig, ("ideal", "realistic"))
         check_fields(self)
+        if self.delay is not None:
+            positive("delay of a run, s", self.delay, "0.002 is 2 ms", zero=True)
+            if self.rig == "ideal":
+                raise InvalidInputError(
+                    "delay of a run",
+                    value=f"{self.delay:g} s, on an ideal rig",
+                    limit="a rig that has one: realistic, or your own driver",
+                    remedy="Leave it out",
+                )
         stall = self.settings.max_step_interval
         if not SHORTEST <= self.period < stall:
             raise InvalidInputError(
@@ -314,7 +327,8 @@ class Recipe:
     @cached_property
     def bench(self) -> Bench:
         """What the realistic rig is like."""
-        return bench_for(self.belief).with_timing(period=self.period)
+        usual = bench_for(self.belief).with_timing(period=self.period)
+        return usual if self.delay is None else usual.with_delay(self.delay)
 
     def make_rig(self) -> RealisticRig:
         """Return the simulated rig, at the start."""
@@ -338,7 +352,7 @@ class Recipe:
         if not isinstance(made, Estimator) or not hasattr(made, "mechanism"):
             raise InvalidInputError(
                 "estimator of a run",
-                value=f"{made!r}, a {type(made).__name__}"[:80],
+                value=f"{made!r}, {a_kind(made)}"[:80],
                 limit="an undertow.estimators.Estimator that its own __init__ has begun",
                 remedy="Derive your own from it: a run asks more of it than reset and estimate",
             )

@@ -214,6 +214,7 @@ def run(
     settings: Settings | None = None,
     target: Mapping[str, float] | Target | None = None,
     estimator: MakeEstimator | None = None,
+    delay: float | None = None,
     progress: Callable[[str, float], None] | None = None,
     **state: float,
 ) -> Report:
@@ -254,6 +255,9 @@ def run(
         Makes an :class:`undertow.estimators.Estimator` for the mechanism and the bench that the
         rig is taken for.  By default a Kalman filter, which learns; the log of a run with another
         one is replayed with it, ``replay("run.db", estimator=...)``.
+    delay
+        From a write to its effect in a reading, s, as :func:`undertow.bring_up.bring_up` measures
+        it; by default that of :func:`undertow.plants.bench.bench_for`.
     progress
         Called with (what, fraction) while the run is prepared.
 
@@ -282,6 +286,7 @@ def run(
             objective=cascade.objective,
             rig="ideal" if isinstance(rig, IdealRig) else "realistic",
             seed=cascade.seed,
+            delay=delay,
             period=0.001 if rig is None else rig.period,
             seconds=math.inf if simulated else max(0.01, 0.3 * settings.lead_time),
             target=() if target is None else _points(target),

@@ -15,7 +15,7 @@ from typing import TypeGuard
 
 import numpy as np
 
-from undertow.base import error_text
+from undertow.base import a_kind, error_text
 from undertow.cascade import Admission, Cascade, CascadeState
 from undertow.cascade.swing_up import SwingUpAndCatch
 from undertow.law import Plan, ReferenceMotion, SlidingModeLaw, Surface, pack_law_parameters
@@ -148,7 +148,7 @@ def respond(cascade: Cascade, request: Request, swing_up: SwingUpAndCatch | None
         return _retarget(cascade, request, x, began)
     proposal: object = cascade.propose(memory, memory.absolute(request.use, x), request.use)
     if not isinstance(proposal, Proposal):
-        proposal = _failed(request, f"not a proposal but a {type(proposal).__name__}")
+        proposal = _failed(request, f"not a proposal but {a_kind(proposal)}")
     judged = judge(cascade, memory, proposal, x, request.use)
     return _answer(request, x, proposal, *judged, began)
 

@@ -17,7 +17,15 @@ from dataclasses import dataclass, fields, replace
 
 import sympy as sp
 
-from undertow.base import InvalidInputError, ModelError, check_fields, checked, one_of, positive
+from undertow.base import (
+    InvalidInputError,
+    ModelError,
+    a_kind,
+    check_fields,
+    checked,
+    one_of,
+    positive,
+)
 from undertow.models.mechanism import Input, Mechanism, Parameter
 from undertow.models.quantities import number_of
 from undertow.models.validity import by_names
@@ -139,7 +147,7 @@ def voltage_driven(mechanism: Mechanism, motors: DCMotor | Mapping[str, DCMotor]
         if not isinstance(motor, DCMotor):
             raise InvalidInputError(
                 f"motor of '{mechanism.name}' on '{name}'",
-                value=f"{motor!r}, a {type(motor).__name__}",
+                value=f"{motor!r}, {a_kind(motor)}",
                 limit="an undertow.models.importers.DCMotor",
                 remedy="Write DCMotor(torque_constant, resistance), from the data sheet",
             )

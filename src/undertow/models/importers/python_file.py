@@ -13,6 +13,7 @@ from undertow.base import (
     ArtefactError,
     InvalidInputError,
     UndertowError,
+    a_kind,
     checked,
     error_text,
     near,
@@ -46,7 +47,7 @@ def mechanism_from_file(text: str) -> Mechanism:
         file, _, name = text.rpartition(":")
         raise InvalidInputError(
             f"'{name}' in '{file}'",
-            value=f"{found!r}, a {type(found).__name__}"[:80],
+            value=f"{found!r}, {a_kind(found)}"[:80],
             limit="undertow.Mechanism, or a function without arguments that returns one",
             remedy="Let the function return the mechanism that it makes",
         )

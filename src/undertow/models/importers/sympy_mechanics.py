@@ -13,7 +13,7 @@ from typing import Any
 
 import sympy as sp
 
-from undertow.base import InvalidInputError, ModelError, at_least, checked, one_of
+from undertow.base import InvalidInputError, ModelError, a_kind, at_least, checked, one_of
 from undertow.models.importers.coordinates import tidy
 from undertow.models.importers.equations import from_matrices
 from undertow.models.mechanism import Coordinate, Input, Mechanism, Parameter
@@ -291,7 +291,7 @@ def _require(name: str, method: object, kind: str) -> None:
     if not isinstance(method, getattr(mechanics, kind)):
         raise InvalidInputError(
             f"method of '{name}'",
-            value=f"{method!r}, a {type(method).__name__}",
+            value=f"{method!r}, {a_kind(method)}",
             limit=f"a sympy.physics.mechanics.{kind}",
             remedy=f"Form its equations first, then give the {kind} itself",
         )

@@ -16,6 +16,7 @@ from undertow.base import (
     ArtefactError,
     InvalidInputError,
     ModelError,
+    a_kind,
     error_text,
     read_file,
     require,
@@ -67,7 +68,7 @@ def parse_xml(source: str | Path, root: str, *more: str) -> ET.Element:
     if not isinstance(source, str | Path):
         raise InvalidInputError(
             f"<{root}> file",
-            value=f"a {type(source).__name__}",
+            value=a_kind(source),
             limit="a path, or XML text",
             remedy="Give pathlib.Path('model.xml'), or the text itself",
         )

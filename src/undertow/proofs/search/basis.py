@@ -15,6 +15,9 @@ from undertow.proofs.region.motion import SurfaceMotion
 #: Candidate sets keep det f / det f(0) above this, and |y_0| below this part of the pole.
 CLEARANCE, POLE_PART = 0.01, 0.985
 
+#: A set reaches far enough with this, m or rad: the region of a linear motion has no end.
+FARTHEST = 100.0
+
 
 class Basis:
     """Monomials of z and their rates along the motion."""

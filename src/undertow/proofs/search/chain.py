@@ -22,7 +22,14 @@ import numpy as np
 from undertow.models.mechanism import FloatArray
 from undertow.proofs.region.lyapunov import LyapunovFunction, directions, extent, unit
 from undertow.proofs.region.motion import SurfaceMotion
-from undertow.proofs.search.basis import CLEARANCE, POLE_PART, Basis, linear_part, slowest_rate
+from undertow.proofs.search.basis import (
+    CLEARANCE,
+    FARTHEST,
+    POLE_PART,
+    Basis,
+    linear_part,
+    slowest_rate,
+)
 from undertow.proofs.search.linear_program import minimise_linear
 
 #: V where the ring begins; how far that edge may come in; t over the slowest rate.
@@ -80,6 +87,8 @@ def grow(
     ring = _Ring(motion, V, degree, rng)
     while growth > LEAST_GROWTH and budget.left:
         reach = extent(V, way)
+        if reach >= FARTHEST:
+            break
         row = ring.next(way, growth, step, reach, budget)
         found = None if row is None else ring.basis.function(row)
         if found is not None and extent(found, way) > reach * 1.0003:

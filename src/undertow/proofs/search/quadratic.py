@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from undertow.models.mechanism import FloatArray
 from undertow.proofs.region.lyapunov import LyapunovFunction, directions
 from undertow.proofs.region.motion import SurfaceMotion
-from undertow.proofs.search.basis import CLEARANCE, POLE_PART, slowest_rate
+from undertow.proofs.search.basis import CLEARANCE, FARTHEST, POLE_PART, slowest_rate
 
 Start = Literal["far", "round", "balanced"]
 
@@ -35,7 +35,7 @@ def quadratic(
     def largest(T: FloatArray, stretched: bool) -> LyapunovFunction:
         """V = |z|², as large as samples allow; the search itself goes without the stretch."""
         bend = (S, pole) if stretched else (None, np.inf)
-        r = _quadratic_radius(motion, LyapunovFunction.quadratic(T, *bend), rays)
+        r = _quadratic_radius(motion, LyapunovFunction.quadratic(T, *bend), rays, way)
         return LyapunovFunction.quadratic(r * T, *bend)
 
     if start == "balanced":
@@ -70,8 +70,14 @@ def _root(P: NDArray[Any]) -> FloatArray:
     return np.asarray(np.linalg.cholesky(np.linalg.inv(0.5 * (P + P.T))))
 
 
-def _quadratic_radius(motion: SurfaceMotion, V: LyapunovFunction, rays: FloatArray) -> float:
-    """Largest r with V̇ < 0 at samples of |z| ≤ r, inside the non-singular set."""
+def _quadratic_radius(
+    motion: SurfaceMotion, V: LyapunovFunction, rays: FloatArray, way: FloatArray
+) -> float:
+    """Largest r with V̇ < 0 at samples of |z| ≤ r, inside the non-singular set.
+
+    Where the motion is linear all r are as good: then as far along ``way`` as anybody asks for.
+    """
+    most = FARTHEST * float(np.linalg.norm(np.linalg.solve(V.scale, way)))
 
     def holds(r: float) -> bool:
         y = V.points(r * rays)
@@ -82,10 +88,10 @@ def _quadratic_radius(motion: SurfaceMotion, V: LyapunovFunction, rays: FloatArr
             and (np.abs(y[:, 0]) < POLE_PART * V.pole).all()
         )
 
-    r = 1.0
+    r = min(1.0, most)
     while not holds(r) and r > 1e-9:
         r /= 2
     grow = r * 1.1
-    while holds(grow) and grow < 1e9:
+    while grow < most and holds(grow):
         r, grow = grow, grow * 1.1
     return r

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from undertow.base import InvalidInputError, error_text
+from undertow.base import InvalidInputError, a_kind, error_text
 from undertow.cascade import Cascade
 from undertow.estimators import Estimator
 from undertow.law import first_surface
@@ -190,7 +190,7 @@ class Entry:
         if not callable(make):
             raise InvalidInputError(
                 f"entrant '{name}'",
-                value=f"a {type(make).__name__}",
+                value=a_kind(make),
                 limit="a class or function of (mechanism, objective)",
             )
         settings = getattr(make, "settings", [{}])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -216,6 +217,31 @@ def summary(found: BringUp) -> tuple[str, ...]:
         )
         lines.append(f"Nothing is wrong{looked}.")
     lines += [f"Wrong: {f.check} of {f.part}: {f.measured}. {f.remedy}." for f in found.wrong]
+    return tuple(lines)
+
+
+def handed_on(name: str, rig: str, found: BringUp) -> tuple[str, ...]:
+    """Return the command that runs a rig with what was identified, and what the driver is to do.
+
+    Empty where something is wrong, which is to be mended first, or nothing was identified.
+    """
+    identified = found.identification
+    if found.wrong or identified is None:
+        return ()
+    estimates, mechanism = identified.estimates, identified.mechanism
+    words = ["undertow", "run", name, "--rig", rig]
+    for parameter in mechanism.parameters:
+        if (one := estimates.get(parameter.name)) is not None:
+            words += ["--set", f"{parameter.name}={one.value:.5g}"]
+    if (late := estimates.get("delay")) is not None:
+        words += ["--delay", f"{max(0.0, late.value):.2g}"]
+    lines = [f"Run it with what was found: {shlex.join(words)}"]
+    for channel in mechanism.inputs:
+        gain = estimates.get(f"gain_{channel.name}")
+        if gain is not None and not gain.low <= 1.0 <= gain.high:
+            lines.append(
+                f"{channel.name} comes out {gain.value:.3g} times: divide by that in the driver"
+            )
     return tuple(lines)
 
 
