@@ -402,6 +402,32 @@ def test_no_answer_is_one_that_the_caller_does_not_admit(
     assert found.cost < found.incumbent_cost
 
 
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_asking_whether_a_plan_is_admitted_is_paid_for(
+    optimisers: dict[str, ut.Optimiser], name: str
+) -> None:
+    """A question that takes as long as all of the search is asked in one batch, and no more."""
+    optimiser = optimisers[name]
+    x = optimiser.loop.mechanism.state(phi=0.4)
+    asked: list[ut.Plan] = []
+
+    def admits(plan: ut.Plan) -> bool:
+        asked.append(plan)
+        return True
+
+    given: dict[str, Any] = {
+        "incumbent": ut.first_surface(optimiser.loop.mechanism),
+        "budget": ut.Budget(1024),
+        "admits": admits,
+    }
+    whole = optimiser.propose(x, **given).evaluations
+    often = len(asked)
+    asked.clear()
+    assert optimiser.propose(x, **given, asking=1024).plan is not None
+    assert 1 <= len(asked) < often
+    assert optimiser.propose(x, **given, part=0.125).evaluations <= 128 < whole
+
+
 @pytest.mark.parametrize("ask", [ut.Optimiser.propose, ut.Optimiser.improve])
 def test_a_sequence_below_zero_is_refused_at_once(
     optimisers: dict[str, ut.Optimiser], ask: Any

@@ -26,6 +26,11 @@ from undertow.optimiser.proposal import check_held
 #: again in smaller steps; and how much smaller they are.
 AGREES, FINER = 1.01, 4
 
+#: What part of the usual evaluations a search for an earlier arrival with a free reaching law takes
+#: after one in the same decision whose plan cannot be mended, and one for what suits every plant
+#: after that, whose evaluations take longer: all of a decision is to take less than its period.
+AGAIN, LAST = 0.5, 0.125
+
 
 class Search(NamedTuple):
     """A search for a first plan: on what loop, and how.
@@ -65,6 +70,8 @@ class Planning:
     def __init__(self, planners: Planners, judge: Judge, resolution: float) -> None:
         self.planners, self.judge, self.resolution = planners, judge, resolution
         self.predictions = planners.predictions
+        optimiser = planners.optimiser
+        self._hurries = planners.recourse and optimiser.aims and not optimiser.freedom.schedule
 
     def first(
         self,
@@ -241,9 +248,12 @@ class Planning:
             standing = judge.standing(replace(state, since=t), loop, used, error, span, soon)
             planner = planners.of(predictions.plausible(state.estimate), state.target, t)
             near: list[Proposal] = []
+            less: dict[str, Any] = (
+                {"part": LAST} if self._hurries else {}
+            )  # no planner of one's own
             for ask in asks:
                 for plan in [standing] if standing is used else [standing, used]:
-                    near.append(planner.propose(error, incumbent=plan, **ask))
+                    near.append(planner.propose(error, incumbent=plan, **ask, **less))
                 if any(found.plan for found in near):
                     break
             return _best_of(near, near)
@@ -270,12 +280,17 @@ class Planning:
         if state.ahead is not None:
             begins.append((state.ahead, math.inf))
         admits = partial(judge.reserve.recovers, loop, error, soon)
+        if self._hurries and loop.ensemble is not None:
+            ask = ask | {"asking": len(loop.ensemble.values) * len(judge.reserve.plans)}
         answers: list[Proposal] = []
         mended: list[Proposal] = []
         # Of single surfaces the best one mostly is admissible; asking all takes long.
         for asked in (admits,) if optimiser.freedom.schedule else (None, admits):
             for plan, cost in begins if not mended else ():
-                found = optimiser.propose(error, incumbent=plan, admits=asked, promised=cost, **ask)
+                part = AGAIN if self._hurries and answers else 1.0
+                found = optimiser.propose(
+                    error, incumbent=plan, admits=asked, promised=cost, part=part, **ask
+                )
                 answers.append(found)
                 if found.plan and judge.mendable(now, loop, found.plan, error, soon):
                     mended.append(found)

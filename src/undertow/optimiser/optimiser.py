@@ -12,7 +12,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from undertow.base import InvalidInputError, at_least, check_fields, checked
+from undertow.base import InvalidInputError, at_least, between, check_fields, checked
 from undertow.closed_loop import ClosedLoop
 from undertow.law import (
     Plan,
@@ -212,6 +212,8 @@ class Optimiser:
         resolution: float = 0.0,
         budget: Budget | None = None,
         admits: Callable[[Plan], bool] | None = None,
+        asking: int = 0,
+        part: float = 1.0,
         promised: float = math.inf,
     ) -> Proposal:
         """Optimise the plan from the state x.
@@ -234,6 +236,10 @@ class Optimiser:
         admits
             Whether a plan that arrives is admissible besides, asked of each that is better than
             all before; where the incumbent is not, the answer may be worse.
+        asking
+            What asking ``admits`` counts as, in evaluations: it takes as long.
+        part
+            What part of the evaluations of its budget the search may take, in (0, 1].
         promised
             What the incumbent was to cost, in a search for an earlier arrival: where nothing near
             it does, a single surface is looked for far and wide, too.
@@ -245,8 +251,12 @@ class Optimiser:
         """
         warm = incumbent is not None
         longest = self.loop.objective.horizon if horizon is None else horizon
-        task = self._task(x, longest, budget or self._budget(warm), resolution, sequence, warm)
-        task.admits, task.promised = admits, promised / task.unit
+        between("part of the evaluations of a search", part, 0.0, 1.0, remedy="1 is usual")
+        at_least("evaluations that asking counts as", asking, 0)
+        given = budget or self._budget(warm)
+        given = replace(given, evaluations=math.ceil(part * given.evaluations))
+        task = self._task(x, longest, given, resolution, sequence, warm)
+        task.admits, task.asking, task.promised = admits, asking, promised / task.unit
         task.usual = budget is None and self.warm is None
         if incumbent is None:
             *_, converged = global_search(task)

@@ -330,7 +330,7 @@ def _model_search(task: Optimisation, here: FloatArray, most: int | None = None)
         resolution=task.resolution,
         relative=WORTHWHILE,
         patience=2,
-        stop=task.late,
+        stop=lambda: task.left <= 0 or task.late(),
     )
     task.score_incumbent(here)  # where there was no time for a single generation
     return search

@@ -104,6 +104,7 @@ class Optimisation:
         self._pace = 0.0
         self.kept = 0
         self.admits: Callable[[Plan], bool] | None = None
+        self.asking = 0
         self.promised, self.usual = math.inf, False
         self.minima: list[float] = []
         self._buffers: dict[int, RolloutBuffers] = {}
@@ -268,7 +269,10 @@ class Optimisation:
     ) -> int:
         """Ask whether those that better the best plan are admitted, until one is; return which."""
         for k in np.argsort(scores, kind="stable")[:DOUBTED]:
-            if not scores[k] < self.best_cost or admits(self.space.plan(z[k])):
+            if not scores[k] < self.best_cost:
+                return int(k)
+            self.evaluations += self.asking
+            if admits(self.space.plan(z[k])):
                 return int(k)
             scores[k], guide[k] = math.inf, max(guide[k], INADMISSIBLE)
         scores[scores < self.best_cost] = math.inf
