@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from undertow.base import (
     InvalidInputError,
+    a_kind,
     at_least,
     check_fields,
     checked,
@@ -214,7 +215,7 @@ class Cascade:
         if self.planner is not None and not callable(getattr(self.planner, "propose", None)):
             raise InvalidInputError(
                 "planner of the cascade",
-                value=f"{self.planner!r}, a {type(self.planner).__name__}",
+                value=f"{self.planner!r}, {a_kind(self.planner)}",
                 limit="an object with the method propose, as undertow.Optimiser has it",
                 remedy="Leave it out for the library's optimiser",
             )

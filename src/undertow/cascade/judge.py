@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from undertow.base import InvalidInputError
+from undertow.base import InvalidInputError, a_kind
 from undertow.cascade.predictions import Predictions, costs_along
 from undertow.cascade.reserve import Reserve
 from undertow.cascade.robustness import sticking_distance
@@ -150,7 +150,7 @@ class Judge:
         if not isinstance(said, Admission):
             raise InvalidInputError(
                 "what the gate of the cascade returned",
-                value=f"{said!r}, a {type(said).__name__}",
+                value=f"{said!r}, {a_kind(said)}",
                 limit="an undertow.cascade.Admission",
                 remedy="Return one: of undertow.cascade.cost_gate, with conditions of your own",
             )
