@@ -254,7 +254,7 @@ class Planning:
             for ask in asks:
                 for plan in [standing] if standing is used else [standing, used]:
                     near.append(planner.propose(error, incumbent=plan, **ask, **less))
-                if any(found.plan for found in near):
+                if len(asks) == 1 or any(found.plan for found in near):
                     break
             return _best_of(near, near)
         except Exception as error:  # the inner loop must survive whatever the outer loop does

@@ -783,9 +783,10 @@ def models(code, constants, outputs, low, high):  # type: ignore[no-untyped-def]
                     _times(T[a], T[-1], C, V)
             else:
                 C[:] = math.nan
-        count = min(LANES, boxes - start)
-        for o in range(len(outputs)):
-            out[start : start + count, o] = T[outputs[o], : E + 1, :count].T
+        for lane in range(min(LANES, boxes - start)):
+            for o in range(len(outputs)):
+                for k in range(E + 1):
+                    out[start + lane, o, k] = T[outputs[o], k, lane]
     return out
 
 
