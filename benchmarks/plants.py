@@ -10,8 +10,7 @@ one.  States are exact; every controller meets the same plants and knows the mod
 kept to the end; *exact* the cascade that takes its model for the plant; *belief* the cascade with a
 belief: an ensemble of what is plausible, learnt as it goes, every 20 ms; *free* the same that may
 choose the reaching law, too; *schedule* one that chooses surfaces with reaching laws, each for
-0.05 s.  Their law acts continuously,
-or with ``--hold`` is sampled, its input held.
+0.05 s.  Their law acts continuously, or with ``--hold`` is sampled, its input held.
 
 *lqr* is clipped linear-quadratic feedback, continuous too, the best on the model of 39 weights,
 by hindsight.  *predictive* plans anew a hundred times a second and holds its input in between: for
