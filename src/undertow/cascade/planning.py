@@ -248,9 +248,8 @@ class Planning:
             standing = judge.standing(replace(state, since=t), loop, used, error, span, soon)
             planner = planners.of(predictions.plausible(state.estimate), state.target, t)
             near: list[Proposal] = []
-            less: dict[str, Any] = (
-                {"part": LAST} if self._hurries else {}
-            )  # no planner of one's own
+            # A planner of one's own has no recourse, and is not told.
+            less: dict[str, Any] = {"part": LAST} if self._hurries else {}
             for ask in asks:
                 for plan in [standing] if standing is used else [standing, used]:
                     near.append(planner.propose(error, incumbent=plan, **ask, **less))
@@ -270,10 +269,11 @@ class Planning:
         what suits all costs less then than a guess.
         """
         planners, judge, predictions = self.planners, self.judge, self.predictions
-        loop, price = predictions.at(state, t), predictions.prior.price_of_time
+        price = predictions.prior.price_of_time
         first = state.predicted == state.scale  # nothing was decided since
         if not planners.recourse or (first and not price > 0):
             return None
+        loop = predictions.at(state, t)
         optimiser = planners.optimiser_of(predictions.estimated(state.estimate), state.target, t)
         used, now = state.at(t), replace(state, since=t)
         begins = [(used, 0.0 if first else state.predicted - (t - state.since) * price)]

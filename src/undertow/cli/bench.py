@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -88,8 +89,8 @@ def bench(
     plant = rig_named(rig, belief, mechanism_named(name), rest, faults, seed)
     if delay is None and isinstance(plant, RealisticRig):
         delay = plant.bench.timing.input_delay + plant.bench.timing.measurement_delay
-    # Closed after what was found is shown: that may fail.
-    with signals_handled(_interrupt), _closed(plant):
+    # Whatever asks for a stop is Ctrl-C.  Closed after what was found is shown: that may fail.
+    with signals_handled(signal.default_int_handler), _closed(plant):
         if in_a_file(rig):
             ready = f"Ready. Let {name} come to rest, hands off, and press Enter."
             exit_unless(enter_pressed(ready))
@@ -110,11 +111,6 @@ def bench(
         said = handed_on(name, rig, found) if in_a_file(rig) else ()
         show(*summary(found), *said, *written)
         exit_unless(not found.wrong)
-
-
-def _interrupt(_number: int, _frame: object) -> None:
-    """Let whatever asks for a stop be Ctrl-C: the inputs go to zero, and the rig is closed."""
-    raise KeyboardInterrupt
 
 
 @contextmanager

@@ -427,12 +427,10 @@ class Controller:
 
     def _waiting(self) -> str:
         """Return in words what a bring-up waited for in vain."""
-        settings, m = self.settings, len(self.u)
+        settings = self.settings
         what = f"no {1e3 * settings.sensor_settling_time:g} ms of sound readings"
         if self._since[0] >= settings.sensor_settling_time:
-            pairs = zip(self._names[m:], self.wrapped[m:], strict=False)
-            where = ", ".join(f"{name} = {value:.3g}" for name, value in pairs)
-            what = f"not where the law can take over, {where}"
+            what = f"not where the law can take over, {self._free_positions()}"
         lacking = self.sensors.worst(self._t - self._began)
         what = f"{what} within {settings.bring_up_timeout:g} s"
         return f"bring-up: {what}{lacking and f'; {lacking}'}"
@@ -447,11 +445,13 @@ class Controller:
         norm = float(np.linalg.norm(self.wrapped))
         if not norm < self.settings.max_state_norm:
             return f"‖x‖ = {norm:.3g}, past {self.settings.max_state_norm:g}"
-        where = ", ".join(
-            f"{c.name} = {value:.3g}"
-            for c, value in zip(coordinates, self.wrapped[m:], strict=False)
-        )
-        return f"the law is singular at {where}, (37)"
+        return f"the law is singular at {self._free_positions()}, (37)"
+
+    def _free_positions(self) -> str:
+        """Return in words where the coordinates are that are not driven."""
+        m = len(self.u)
+        pairs = zip(self._names[m:], self.wrapped[m:], strict=False)
+        return ", ".join(f"{name} = {value:.3g}" for name, value in pairs)
 
     def _proceed(self, t: float) -> None:
         """Go on to the surface of a schedule that is in force at the time t."""
