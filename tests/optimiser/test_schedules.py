@@ -276,5 +276,9 @@ def test_refusals() -> None:
     with pytest.raises(InvalidInputError, match="whole part of the period"):
         ut.Cascade(rig, ut.MinimumTime(), belief="exact",
                    freedom=ut.DecisionVariables(reaching=True, schedule=0.07))  # fmt: skip
+    free = ut.DecisionVariables
+    for beyond in free(reaching=True, schedule=100.0), free(times=(0.0, 100.0)):
+        with pytest.raises(InvalidInputError, match="100 s, must be 0 s to 60 s"):
+            ut.Cascade(rig, ut.MinimumEnergy(horizon=60.0), freedom=beyond)
     with pytest.raises(InvalidInputError, match="least time"):
         ut.Optimiser(ut.Cascade(rig, ut.MinimumTime()).loop, freedom=FREE).propose(rig.usual_start)

@@ -16,11 +16,15 @@ import sympy as sp
 
 import undertow as ut
 from undertow.base import ArtefactError, InvalidInputError, as_text
+from undertow.cascade import CascadeState
+from undertow.cascade.robustness import BenchGate
 from undertow.estimators import Record
+from undertow.law import Plan
+from undertow.models import FloatArray
 from undertow.models.importers import holding_input
 from undertow.objective import objective_for
 from undertow.plants import Bench, Friction, Push, srv02_rig
-from undertow.runtime import Report
+from undertow.runtime import Recipe, Report
 from undertow.runtime.controller_defaults import estimator_for
 from undertow.studies.experiment import grouped
 from undertow.studies.ledger import Ledger
@@ -38,6 +42,7 @@ from undertow.studies.trials.report import (
 from undertow.studies.trials.robustness import breaking_point, random_bench
 from undertow.studies.trials.steering import (
     CascadeSteering,
+    cascade_and_kept,
     clipped_regulator,
     keeping,
     predictive,
@@ -110,6 +115,29 @@ def test_the_same_seed_gives_the_same_run_bit_for_bit(arm: ut.Mechanism) -> None
     ]
     assert np.array_equal(records[0].u, records[1].u)
     assert np.array_equal(records[0].truth, records[1].truth)
+
+
+def test_a_cascade_is_tried_as_a_run_would_make_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trials, campaigns and comparisons try on a bench what ``undertow run`` would run there."""
+    beam = ut.mechanisms.ball_and_beam()
+    recipe = Recipe(beam, rig="realistic")
+    suited, bench = recipe.cascade, recipe.bench
+    begun: list[ut.Cascade] = []
+
+    def start(self: ut.Cascade, x0: FloatArray) -> tuple[CascadeState, None]:
+        begun.append(self)
+        return CascadeState(Plan.of(ut.first_surface(self.mechanism))), None
+
+    monkeypatch.setattr(ut.Cascade, "start", start)
+    plain = ut.Cascade(beam, objective_for(beam, "bench-energy"))
+    cascade_and_kept(plain, bench, beam.usual_start)
+    own = ut.ReachingLaw(30.0, 0.2)
+    cascade_and_kept(replace(plain, reaching=own), bench, beam.usual_start)
+    assert plain.reaching != suited.reaching == begun[0].reaching
+    assert isinstance(begun[0].gate, BenchGate)
+    assert repr(begun[0].gate) == repr(suited.gate)
+    np.testing.assert_array_equal(np.array(begun[0].covariance), np.array(suited.covariance))
+    assert begun[1].reaching == own
 
 
 def test_a_run_is_balanced_only_if_it_stays_so(arm: ut.Mechanism) -> None:

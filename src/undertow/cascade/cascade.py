@@ -18,6 +18,7 @@ from undertow.base import (
     InvalidInputError,
     a_kind,
     at_least,
+    between,
     check_fields,
     checked,
     instant,
@@ -203,6 +204,9 @@ class Cascade:
                 limit=f"multiples of the period, {self.period:g} s",
                 remedy="Then what is left of a plan is a plan again",
             )
+        horizon, latest = self.objective.horizon, max(self.freedom.schedule, *self.freedom.times)
+        remedy = f"The period, {self.period:g} s, is usual; or take a longer horizon"
+        between("schedule of the cascade", latest, 0.0, horizon, "s", remedy)
         parts = self.period / (self.freedom.schedule or self.period)
         whole = max(parts, 1 / parts)
         if abs(whole - round(whole)) > 1e-6:

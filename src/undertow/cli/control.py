@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from undertow.base import InvalidInputError, between
+from undertow.base import InvalidInputError
 from undertow.cascade import Cascade, Gate
 from undertow.cli import options
 from undertow.cli.parsing import aimed, parse_surface, parse_target, parse_task, parse_values
@@ -115,7 +115,6 @@ def simulate(
                 limit="the cascade, which decides by it",
                 remedy="Leave it out, or --control and --surface",
             )
-    between("--schedule", schedule, 0.0, horizon, "s", "0.1, the period, is usual")
     if steering == "cascade":
         gate = default_gate() if accept is None else _evidence_gate(accept)
         known = known or ("exact" if accept or schedule else "usual")

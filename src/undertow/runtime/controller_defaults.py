@@ -94,12 +94,20 @@ def _delay(period: float, periods: float) -> float:
 
 
 def for_rig(cascade: Cascade, estimator: Estimator) -> Cascade:
-    """Return a cascade whose gate and covariance suit a rig, where they are for exact states."""
-    gate = default_gate(estimator) if cascade.gate is cost_gate else cascade.gate
-    covariance = cascade.covariance
-    if covariance is None:
-        covariance = estimator.noise_covariance()
-    return replace(cascade, gate=gate, covariance=covariance)
+    """Return a cascade that suits a rig, where it is as it stands for exact states.
+
+    The gate becomes :func:`default_gate`, the reaching law :func:`reaching_for`, the covariance
+    that of the estimator's noise; what was chosen stays.
+    """
+    chosen = cascade.reaching != ReachingLaw()
+    return replace(
+        cascade,
+        gate=default_gate(estimator) if cascade.gate is cost_gate else cascade.gate,
+        reaching=cascade.reaching if chosen else reaching_for(estimator),
+        covariance=estimator.noise_covariance()
+        if cascade.covariance is None
+        else cascade.covariance,
+    )
 
 
 def reaching_for(estimator: Estimator) -> ReachingLaw:

@@ -15,7 +15,7 @@ from undertow.base import InvalidInputError, UndertowError, a_kind, check_fields
 from undertow.cascade import Cascade, CascadeState, Legs, derate_actuator
 from undertow.cascade.swing_up import CatchRegion, SwingUpAndCatch, designed, hanging
 from undertow.estimators import Estimator, MakeEstimator
-from undertow.law import Plan, ReachingLaw, Reference, ReferenceMotion, SetPoints
+from undertow.law import Plan, Reference, ReferenceMotion, SetPoints
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import named
 from undertow.models import FloatArray, Mechanism, invariant_coordinates
@@ -28,7 +28,6 @@ from undertow.runtime.controller_defaults import (
     RESERVE,
     estimator_for,
     for_rig,
-    reaching_for,
 )
 from undertow.runtime.encoding import MOVING, reference_from, reference_to
 from undertow.runtime.settings import Settings
@@ -234,13 +233,8 @@ class Recipe:
     @cached_property
     def cascade(self) -> Cascade:
         """Law, optimiser and gate."""
-        estimator, design = self.make_estimator(), self._designed
-        given = design.reaching != ReachingLaw()
-        return replace(
-            for_rig(design, estimator),
-            reaching=design.reaching if given else reaching_for(estimator),
-            warm=design.warm or Budget(self.evaluations, self.seconds),
-        )
+        suited = for_rig(self._designed, self.make_estimator())
+        return replace(suited, warm=suited.warm or Budget(self.evaluations, self.seconds))
 
     @cached_property
     def _designed(self) -> Cascade:

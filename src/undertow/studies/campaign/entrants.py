@@ -18,6 +18,7 @@ from undertow.law import first_surface
 from undertow.models import FloatArray, Mechanism
 from undertow.models.importers.python_file import in_a_file, named_in_file
 from undertow.objective import Objective
+from undertow.plants.bench import bench_for
 from undertow.studies.trials.steering import (
     cascade_and_kept,
     clipped_regulator,
@@ -139,11 +140,12 @@ class Feedback:
 
 @lru_cache(maxsize=4)
 def _optimised(mechanism: Mechanism, objective: Objective) -> tuple[MakeController, MakeController]:
-    return cascade_and_kept(Cascade(mechanism, objective), mechanism.usual_start)
+    cascade, bench = Cascade(mechanism, objective), bench_for(mechanism)
+    return cascade_and_kept(cascade, bench, mechanism.usual_start)
 
 
 def steered(mechanism: Mechanism, objective: Objective) -> Feedback:
-    """Return the cascade as it is by default: ensemble, learning, gate, 10 decisions a second."""
+    """Return the cascade as ``undertow run`` makes it for the usual bench."""
     return Feedback(_optimised(mechanism, objective)[0])
 
 

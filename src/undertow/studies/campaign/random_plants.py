@@ -25,7 +25,8 @@ class RandomPlants(Study):
     """Trials on random benches: estimator, encoders, friction and delay are in.
 
     The contenders are the cascade, its first optimum kept, and a clipped linear-quadratic
-    regulator.  All believe the mechanism as it is and have the same kind of estimator.  A plant
+    regulator.  All believe the mechanism as it is and have the same kind of estimator, and the
+    first two are fit for the usual bench, see :func:`undertow.runtime.for_rig`.  A plant
     differs in its parameters, friction and delay, drawn from (``seed``, its number).
 
     Settings: ``plants``, how many; ``controllers``, a list of ``cascade``, ``kept``, ``lqr``;
@@ -73,7 +74,7 @@ class RandomPlants(Study):
     @cached_property
     def _optimised(self) -> tuple[MakeController, MakeController]:
         cascade = Cascade(self.mechanism, self.objective, seed=self.seed)
-        return cascade_and_kept(cascade, self.start)
+        return cascade_and_kept(cascade, self.bench, self.start)
 
     def controller(self, name: str) -> MakeController:
         """Return what makes a contender for one trial."""

@@ -20,7 +20,6 @@ from undertow.models import FloatArray, Mechanism
 from undertow.objective import Goal, Objective, objective_for
 from undertow.optimiser import Budget
 from undertow.plants import Bench, srv02_rig
-from undertow.runtime import estimator_for, for_rig
 from undertow.studies.ledger import Key
 from undertow.studies.paper.data import BASE, ROWS
 from undertow.studies.trials.steering import cascade_and_kept, keeping
@@ -47,11 +46,10 @@ def controllers(
     """Return the three controllers of the paper's tables, by name.
 
     ``one-time`` is optimised once, from x0; ``cascade`` starts from there, and its
-    re-optimisations may spend ``budget`` rollouts each.  Of the bench the gate knows what its
-    estimator does.
+    re-optimisations may spend ``budget`` rollouts each.
     """
     exact = Cascade(belief, objective, warm=Budget(budget))
-    cascade, once = cascade_and_kept(for_rig(exact, estimator_for(belief, bench)), x0)
+    cascade, once = cascade_and_kept(exact, bench, x0)
     return {"base": keeping(belief, BASE), "one-time": once, "cascade": cascade}
 
 

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any, TypeVar
 
-import numpy as np
-
 from undertow.base import (
     as_text,
     at_least,
@@ -22,7 +20,7 @@ from undertow.base import (
 from undertow.cascade import Cascade
 from undertow.estimators import Belief
 from undertow.law import Surface
-from undertow.models import Mechanism, StateLike
+from undertow.models import FloatArray, Mechanism, StateLike
 from undertow.objective import Objective
 from undertow.plants import Bench
 from undertow.plants.bench import bench_for
@@ -158,7 +156,8 @@ def compare(
 
     All have the same kind of estimator, and what it knows of a disturbance at the inputs is taken
     off the output of each.  It learns the usual parameters, for a cascade those that its belief
-    leaves open.
+    leaves open.  A cascade with the gate and the reaching law of exact states is made fit for what
+    is known of each plant's sensors and delays, as :func:`undertow.run` does.
 
     Parameters
     ----------
@@ -207,10 +206,10 @@ def compare(
         objective = next((c.objective for c in named.values() if isinstance(c, Cascade)), None)
     outcomes = {}
     for name, controller in named.items():
-        make = _maker(mechanism, controller, start)
         for place, plant in meets.items():
             bench = Bench(plant) if isinstance(plant, Mechanism) else plant
             mechanism.check_plant(bench.mechanism)
+            make = _maker(mechanism, controller, bench, start)
             known = controller.known if isinstance(controller, Cascade) else Belief.usual(mechanism)
             outcomes[name, place] = trial(
                 mechanism, bench, make, start, seconds, seed,
@@ -220,11 +219,11 @@ def compare(
 
 
 def _maker(
-    mechanism: Mechanism, controller: Contender, start: np.ndarray[Any, np.dtype[np.float64]]
+    mechanism: Mechanism, controller: Contender, bench: Bench, start: FloatArray
 ) -> MakeController:
     """Return what makes the controller of one run."""
     if isinstance(controller, Cascade):
-        return cascade_and_kept(controller, start)[0]
+        return cascade_and_kept(controller, bench, start)[0]
     if isinstance(controller, Surface):
         return keeping(mechanism, controller)
     return controller

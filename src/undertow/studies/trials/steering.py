@@ -31,7 +31,8 @@ from undertow.models import (
 from undertow.models.importers import holding_input
 from undertow.objective import Objective, finite_limits
 from undertow.optimiser import Proposal
-from undertow.runtime import Settings
+from undertow.plants import Bench
+from undertow.runtime import Settings, estimator_for, for_rig
 from undertow.runtime.controller import EARLY_LEAD
 from undertow.studies.trials.trial import MakeController
 
@@ -128,17 +129,23 @@ class CascadeSteering:
         self.waiting = self.cascade.propose(self.memory, ahead, later)
 
 
-def cascade_and_kept(cascade: Cascade, x0: FloatArray) -> tuple[MakeController, MakeController]:
+def cascade_and_kept(
+    cascade: Cascade, bench: Bench, x0: FloatArray
+) -> tuple[MakeController, MakeController]:
     """Return the makers of the cascade and of its first optimum, kept: one search from x0, (2n,).
+
+    Both are as :func:`undertow.runtime.for_rig` makes them for what is told of the bench.
 
     Raises
     ------
     InfeasibleError
         When the first optimisation finds no admissible surface.
     """
-    start = cascade.start(x0)
-    kept = keeping(cascade.mechanism, start[0].surface, cascade.reaching)
-    return lambda _: CascadeSteering(cascade, start), kept
+    known = estimator_for(cascade.mechanism, bench, known=cascade.known)
+    suited = for_rig(cascade, known)
+    start = suited.start(x0)
+    kept = keeping(suited.mechanism, start[0].surface, suited.reaching)
+    return lambda _: CascadeSteering(suited, start), kept
 
 
 class NMPC:
