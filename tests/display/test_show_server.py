@@ -287,7 +287,7 @@ def test_a_log_becomes_a_recording_and_one_file(tmp_path: Path, memory: CascadeS
         (["show", "rotary_pendlum"], "Did you mean rotary_pendulum"),
         (
             ["show", "rotary_pendulum", "--start", "phi=0.5deg", "--save", "page.html"],
-            "more than 0.05",
+            "more than 0.01",
         ),
         (["show", "nothing.db"], "log 'nothing.db'"),
         (["show", "rotary_pendulum", "--mechanism", "a.py:b"], "--mechanism"),

@@ -116,11 +116,11 @@ def test_the_first_prediction_is_for_where_it_starts(simulation: Simulation) -> 
 
     def rate(t: float, z: np.ndarray) -> np.ndarray:
         x, u = z[:4], law(t, z[:4]).u
-        paid = float(u @ u) + 0.05 * float(x @ x)
+        paid = float(u @ u) / 15.0**2 + 0.01 * float(x @ x)
         return np.concatenate([x[2:], RIG.accelerations(t, x, u), [paid]])
 
     def arrives(t: float, z: np.ndarray) -> float:
-        return float(np.linalg.norm(z[:4])) - 0.05
+        return float(np.linalg.norm(z[:4])) - 0.01
 
     arrives.terminal = True  # type: ignore[attr-defined]
     begin = np.append(RIG.usual_start, 0.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import ctypes
+import inspect
 import io
 import json
 import math
@@ -38,7 +39,10 @@ from undertow.cascade import (
     robustness_gate,
 )
 from undertow.cli import app
+from undertow.cli.control import simulate
 from undertow.cli.parsing import objective_named, parse_start
+from undertow.cli.rig import run as run_on_a_rig
+from undertow.cli.show import show
 from undertow.display.animation import Film
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import from_anywhere, named
@@ -89,9 +93,12 @@ def test_a_word_means_one_problem_everywhere(word: Goal) -> None:
         assert problem == ut.objective_for(RIG, word)
 
 
-def test_rigs_are_run_for_the_bench_words_and_take_the_paper_s() -> None:
-    """What a bench minimised so far goes on under its own word, and is what is minimised there."""
-    assert Recipe().objective == "bench-energy"
+def test_rigs_are_run_for_what_simulations_are_and_take_the_paper_s() -> None:
+    """One usual objective, whatever the unit of the inputs; the paper's and the bench's by word."""
+    usual = inspect.signature(ut.objective_for).parameters["word"].default
+    assert Recipe().objective == usual == "effort"
+    for command in (simulate, run_on_a_rig, show):
+        assert inspect.signature(command).parameters["objective"].default == usual
     assert Recipe(objective="energy").cascade.objective.stage_cost(RIG) == V**2
     _, out, _ = run("run", "--help")
     assert "bench-energy" in out

@@ -478,7 +478,10 @@ def test_a_motor_that_is_faster_than_the_samples_is_run(seed: int) -> None:
 
     With the usual budget: of 64 evaluations that for seed 0 falls after 5 s.
     """
-    recipe = Recipe("wheeled_inverted_pendulum", rig="realistic", period=0.01, seed=seed)
+    recipe = Recipe(
+        "wheeled_inverted_pendulum",
+        rig="realistic", period=0.01, seed=seed, objective="bench-energy",
+    )  # fmt: skip
     with session(recipe, simulated=True) as runtime:
         report = runtime.run(10.0)
     assert report.verdict.ending == "balanced"

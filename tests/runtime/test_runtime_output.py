@@ -590,13 +590,13 @@ def test_rows_lost_from_the_log_are_told_and_degrade_the_run(
 def test_the_cost_of_a_run_is_the_integral_of_its_stage_cost(
     controller: Controller, tmp_path: Path
 ) -> None:
-    """Against the log: Φ = u² + 0.05 xᵀx, and ‖x‖ of the last estimate."""
+    """Against the log: Φ = (u/15)² + 0.01 xᵀx, and ‖x‖ of the last estimate."""
     from undertow.runtime import read_log
 
     report = driven(controller, Device(), 1.0, tmp_path / "run.db").report
     recording = read_log(tmp_path / "run.db")
     x = np.column_stack([recording[name] for name in RECIPE.belief.state_names])
-    stage = recording["voltage"] ** 2 + 0.05 * (x**2).sum(axis=1)
+    stage = (recording["voltage"] / 15.0) ** 2 + 0.01 * (x**2).sum(axis=1)
     assert report.cost == pytest.approx(float(stage[:-1] @ np.diff(recording["t"])), rel=1e-9)
     assert report.final_error == pytest.approx(float(np.linalg.norm(x[-1])))
 

@@ -58,7 +58,8 @@ def test_a_target_past_the_travel_is_refused_before_the_rig_is_read(cascade: ut.
 
 def test_a_jump_is_planned_on_the_estimate_of_its_request() -> None:
     """The slow loop's first plan for a new target, predicted for the plant that was learnt."""
-    recipe = Recipe(start=(0.0, 0.1, 0.0, 0.0), evaluations=64)
+    start = (0.0, 0.1, 0.0, 0.0)
+    recipe = Recipe(start=start, objective="bench-energy", evaluations=64)
     memory, known = recipe.first(), recipe.cascade.known
     assert memory.estimate is not None
     assert known is not None

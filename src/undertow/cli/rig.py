@@ -41,7 +41,7 @@ from undertow.cli.terminal import (
 from undertow.law import Reference, SetPoints
 from undertow.mechanisms.named import from_anywhere
 from undertow.models.importers.python_file import in_a_file
-from undertow.objective import Goal
+from undertow.objective import USUAL, Goal
 
 if TYPE_CHECKING:
     from undertow.models import Coordinate
@@ -65,7 +65,7 @@ def run(
     target: options.Target = None,
     seconds: Annotated[float, typer.Option(min=0.001)] = 10.0,
     rig: str = "ideal",
-    objective: options.Goal = "bench-energy",
+    objective: options.Goal = USUAL,
     swing_up: bool = False,
     setting: options.Settings = None,
     known: Annotated[Literal["usual", "exact"], typer.Option("--belief")] = "usual",

@@ -17,6 +17,7 @@ from undertow.cli.terminal import command, progress_bar
 from undertow.cli.terminal import show as say
 from undertow.models import Mechanism
 from undertow.models.importers.formats import file_words
+from undertow.objective import USUAL
 
 if TYPE_CHECKING:
     from undertow.display.live import Show
@@ -73,7 +74,7 @@ def show(
         ),
     ] = "rotary_pendulum",
     start: options.Start = None,
-    objective: options.Goal = "bench-energy",
+    objective: options.Goal = USUAL,
     setting: options.Settings = None,
     limit: options.Limits = None,
     period: float = 0.1,

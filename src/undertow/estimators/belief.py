@@ -44,6 +44,7 @@ from undertow.models import (
     Mechanism,
     Parameter,
     force_scale,
+    full_accelerations,
     linear_accelerations,
     number_of,
 )
@@ -268,17 +269,8 @@ class Belief:
         """Standard deviations of the changes of velocity, (n,)."""
         if self.noise is not None:
             return np.broadcast_to(np.asarray(self.noise, dtype=float), self.mechanism.n)
-        scale = SMALL * self.full_accelerations
+        scale = SMALL * full_accelerations(self.mechanism)
         return np.where(scale > 0, scale, UNDRIVEN)
-
-    @cached_property
-    def full_accelerations(self) -> FloatArray:
-        """What the full inputs do to each acceleration at the target, (n,), rad/s² or m/s²."""
-        limits, rest = self.mechanism.input_limits, np.zeros(2 * self.mechanism.n)
-        full = np.diag(np.where(np.isfinite(limits), limits, 1.0))
-        still = self.mechanism.accelerations(0.0, rest, np.zeros(len(limits)))
-        driven = sum(np.abs(self.mechanism.accelerations(0.0, rest, u) - still) for u in full)
-        return np.asarray(driven, dtype=float)
 
     @cached_property
     def places(self) -> list[int]:

@@ -76,7 +76,7 @@ class Estimator(ABC):
 
     @property
     def jumps(self) -> int:
-        """How often velocities have jumped: what was planned before is for another motion."""
+        """How often velocities have been knocked: what was planned is for another motion."""
         return 0
 
     @property

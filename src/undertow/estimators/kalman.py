@@ -33,7 +33,13 @@ from numpy.typing import ArrayLike
 from undertow.base import InvalidInputError, one_for_each, positive
 from undertow.estimators.belief import EVEN, Belief, ParameterEstimate
 from undertow.estimators.interface import Estimator
-from undertow.models import FloatArray, Mechanism, fastest_rate, require_smooth
+from undertow.models import (
+    FloatArray,
+    Mechanism,
+    fastest_rate,
+    full_accelerations,
+    require_smooth,
+)
 from undertow.plants import Measurement
 from undertow.plants.interface import copy_numbers
 from undertow.plants.stepping import compiled_module
@@ -41,8 +47,9 @@ from undertow.symbolic import BRIEF, COMPILED, Workspace, numba, unpacked
 
 #: Parameters are learnt while some acceleration is larger than this part of what the full inputs do
 #: to it at the target, and than what the estimated disturbance does besides: what the model leaves
-#: out, dry friction, is small beside it.
-EXCITED = 0.1
+#: out, dry friction, is small beside it.  And than what the inputs have changed by in the last few
+#: ms: with a delay that the model leaves out they do not act yet, as if the masses were larger.
+EXCITED, LATE = 0.1, 0.006
 
 #: Standard deviation of a matched disturbance before anything moves, as a part of the input's
 #: limit: half of it, two deviations, is what a controller makes up for.  With less, dry friction
@@ -55,6 +62,11 @@ AVERAGED = 1.0
 #: Standard deviations beyond which an innovation is none of noise and model: of 10⁹ samples that
 #: are, two.
 JUMP = 6.0
+
+#: A jump of a velocity is a knock, after which what was planned is for another motion, if the full
+#: inputs take longer than this for as much, s.  What is less is not told from a delay or friction
+#: that the model does not know, and no plan is lost to it.
+KNOCK = 0.005
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -123,14 +135,15 @@ def repeated(count: float, h: float, speed: float, spread: float, noise: float) 
 @numba.njit(cache=True, error_model="numpy")
 def readings_after_jump(
     x: FloatArray, P: FloatArray, q: FloatArray, variance: FloatArray, h: float,
-    odd: FloatArray, taken: FloatArray,
+    knock: FloatArray, odd: FloatArray, taken: FloatArray,
 ) -> bool:  # fmt: skip
     """Write the positions to be taken in into ``taken``; whether the velocities have jumped.
 
     x and P are predicted.  ``odd`` is for how long readings have been off, s, how many in a row,
-    and how often velocities have jumped so far.  A jump at the beginning of that time widens P.
+    and how often so far a velocity has jumped by more than ``knock``, (n,).  A jump at the
+    beginning of that time widens P.
     """
-    n, off = q.shape[0], False
+    n, off, knocked = q.shape[0], False, False
     for i in range(n):
         error = q[i] - x[i]
         taken[i] = q[i]
@@ -143,17 +156,18 @@ def readings_after_jump(
     odd[1] += 1.0
     if odd[1] < 2.0:
         return False
-    if odd[1] == 2.0:
-        odd[2] += 1.0
     for i in range(n):
         taken[i] = math.nan
         if abs(q[i]) < math.inf:
             taken[i] = q[i]
+            knocked = knocked or abs(q[i] - x[i]) > knock[i] * odd[0]
             way = (q[i] - x[i]) ** 2
             P[i, i] += way
             P[i, n + i] += way / odd[0]
             P[n + i, i] += way / odd[0]
             P[n + i, n + i] += way / odd[0] ** 2
+    if knocked and odd[1] == 2.0:
+        odd[2] += 1.0
     odd[0] = 0.0
     return True
 
@@ -166,7 +180,7 @@ _LAYOUT = {
     "parameters": "p", "count": "1", "past": "lead + 1, m", "P": "size, size",
     "F": "size, size", "A": "size, size", "work": "7, size", "odd": "3",
     "place": "known", "nominal": "known", "tolerance": "known", "reach": "known",
-    "excited": "n", "felt": "m", "fastest": "1",
+    "excited": "n", "knock": "n", "last": "m", "stirred": "1", "felt": "m", "fastest": "1",
 }  # fmt: skip
 
 _BODY = f"""
@@ -228,8 +242,12 @@ def estimate(h, q, u, block, size, lead, known):
     stage, total, qdd, base, viscous, driven, taken = (
         work[0], work[1], work[2], work[3], work[4], work[5], work[6]
     )
+    changed = 0.0
     for i in range(m):
-        past[start % (lead + 1), i] = max(-limits[i], min(limits[i], u[i]))
+        clipped = max(-limits[i], min(limits[i], u[i]))
+        changed = max(changed, abs(clipped - last[i]) / limits[i])
+        past[start % (lead + 1), i] = last[i] = clipped
+    stirred[0] = stirred[0] * max(0.0, 1.0 - h / {LATE}) + changed
     then = past[(start + 1) % (lead + 1)]
     parts = max(1, math.ceil(h * fastest[0] - 1e-9))  # of a period: short beside the fastest mode
     part = h / parts
@@ -239,9 +257,9 @@ def estimate(h, q, u, block, size, lead, known):
             driven
         )
         move(part, x, then, n, m, disturbed, parameters, stage, total, qdd, viscous, driven)
-        moving, louder = learnt, 0.0
+        moving, louder = learnt, stirred[0]
         for i in range(m if disturbed else 0):
-            louder = max(louder, abs(x[2 * n + i]) / limits[i])
+            louder = max(louder, stirred[0] + abs(x[2 * n + i]) / limits[i])
         for i in range(n):
             if abs(base[i]) > excited[i] * (1.0 + louder / {EXCITED}):
                 moving = size
@@ -252,7 +270,7 @@ def estimate(h, q, u, block, size, lead, known):
         if moving > learnt:
             new = now[i] - counts[i] * counts[i] / 12.0
             share[i] = 1.0 / repeated(counts[i], h, x[n + i], P[n + i, n + i], new)
-    if readings_after_jump(x, P, q, now, h, odd, taken):
+    if readings_after_jump(x, P, q, now, h, knock, odd, taken):
         share[:] = 0.0
     measurement_update(x, P, taken[:n], now, total, learnt, share)
     for j in range(known):
@@ -394,6 +412,7 @@ class KalmanFilter(Estimator):
         self._x, self._out = memory["x"], memory["out"]
         self._P: FloatArray = memory["P"]
         self._odd: FloatArray = memory["odd"]
+        self._last, self._stirred = memory["last"], memory["stirred"]
         self.felt = memory["felt"]
         self._variance, self._F = memory["variance"], memory["F"]
         counts = memory["counts"]
@@ -406,6 +425,7 @@ class KalmanFilter(Estimator):
         memory["noise"][n : 2 * n] = unknown**2
         memory["noise"][2 * n : self._learnt] = disturbance_drift**2
         memory["limits"][:] = self._limits = mechanism.input_limits
+        memory["knock"][:] = KNOCK * full_accelerations(mechanism)
         self.parameters = memory["parameters"]
         if belief is not None:
             memory["noise"][self._learnt :] = parameter_drift**2
@@ -413,7 +433,7 @@ class KalmanFilter(Estimator):
             memory["nominal"][:] = mechanism.parameter_values[belief.places]
             memory["tolerance"][:] = list(belief.tolerances.values())
             memory["reach"][:] = belief.room
-            memory["excited"][:] = EXCITED * belief.full_accelerations
+            memory["excited"][:] = EXCITED * full_accelerations(mechanism)
         self.belief = belief
         self._state: FloatArray = self._out[: 2 * n]
         if disturbance_drift > 0:
@@ -441,6 +461,7 @@ class KalmanFilter(Estimator):
         np.fill_diagonal(self._P, variances)
         self.parameters[:] = self.mechanism.parameter_values
         self._past[:], self._count[0], self._t = 0.0, 0, math.nan
+        self._last[:], self._stirred[0] = 0.0, 0.0
         self._odd[:] = self.felt[:] = 0.0
         self._out[:] = self._x
 
@@ -453,7 +474,7 @@ class KalmanFilter(Estimator):
 
     @property
     def jumps(self) -> int:
-        """How often velocities have jumped: what was planned before is for another motion."""
+        """How often velocities have been knocked: what was planned is for another motion."""
         return int(self._odd[2])
 
     @property

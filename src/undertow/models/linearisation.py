@@ -285,6 +285,18 @@ def _force_at_target(mechanism: Mechanism, given: FloatArray) -> tuple[FloatArra
         ) from error
 
 
+def full_accelerations(mechanism: Mechanism) -> FloatArray:
+    """What the full inputs do to each acceleration at the target, (n,), rad/s² or m/s².
+
+    Of an input without a limit one unit counts.
+    """
+    limits, rest = mechanism.input_limits, np.zeros(2 * mechanism.n)
+    full = np.diag(np.where(np.isfinite(limits), limits, 1.0))
+    still = mechanism.accelerations(0.0, rest, np.zeros(len(limits)))
+    driven = sum(np.abs(mechanism.accelerations(0.0, rest, u) - still) for u in full)
+    return np.asarray(driven, dtype=float)
+
+
 def controllability(mechanism: Mechanism) -> float:
     """Distance of (A, B) at the target from an uncontrollable pair, relative, ≥ 0.
 

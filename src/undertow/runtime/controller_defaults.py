@@ -15,7 +15,7 @@ from undertow.cascade import Cascade, Gate, cost_gate, noise_share, robustness_g
 from undertow.cascade.robustness import delay_margin
 from undertow.estimators import Belief, Estimator, KalmanFilter
 from undertow.law import ReachingLaw, first_surface
-from undertow.models import Mechanism
+from undertow.models import Mechanism, full_accelerations
 from undertow.objective import finite_limits
 from undertow.plants import Bench, Encoder
 
@@ -49,7 +49,7 @@ def estimator_for(
     parameters, which are then learnt.
     """
     encoders = [bench.encoders.get(c.name, Encoder()) for c in belief.coordinates]
-    full, timing = Belief(belief, {}).full_accelerations, bench.timing
+    full, timing = full_accelerations(belief), bench.timing
     return KalmanFilter(
         belief,
         timing.period,

@@ -19,7 +19,7 @@ from undertow.law import Plan, Reference, ReferenceMotion, SetPoints
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import named
 from undertow.models import FloatArray, Mechanism, invariant_coordinates
-from undertow.objective import Goal, Objective, objective_for
+from undertow.objective import USUAL, Goal, Objective, objective_for
 from undertow.optimiser import Budget
 from undertow.plants import Bench, IdealRig, RealisticRig
 from undertow.plants.bench import bench_for
@@ -72,7 +72,7 @@ class Recipe:
     start
         Initial state, (2n,); the mechanism's usual one by default, where it has one.
     objective
-        An objective, or a word of :func:`undertow.objective_for`; ``"bench-energy"`` suits a rig.
+        An objective, or a word of :func:`undertow.objective_for`.
     horizon
         Longest prediction, s; an objective brings its own.
     rig
@@ -117,7 +117,7 @@ class Recipe:
     mechanism: str | Mechanism = "rotary_pendulum"
     parameters: Mapping[str, float] = field(default_factory=dict)
     start: tuple[float, ...] = ()
-    objective: Goal | Objective = "bench-energy"
+    objective: Goal | Objective = USUAL
     horizon: float = 20.0
     rig: Literal["ideal", "realistic"] = "ideal"
     seed: int = 0

@@ -10,6 +10,7 @@ import numpy as np
 
 from undertow.cascade import Cascade
 from undertow.models import Mechanism
+from undertow.objective import USUAL
 from undertow.plants import Bench
 from undertow.plants.bench import bench_for
 from undertow.studies.campaign.definition import Settings, objective_of
@@ -40,7 +41,7 @@ class RandomPlants(Study):
 
     def __init__(self, mechanism: Mechanism, settings: Settings) -> None:
         self.mechanism = mechanism
-        self.objective = objective_of(mechanism, settings, 60.0, "bench-energy")
+        self.objective = objective_of(mechanism, settings, 60.0, USUAL)
         self.controllers = settings.words("controllers", CONTROLLERS)
         self.spread = settings.number("spread", 0.2, low=0.0, high=0.9)
         self.friction = settings.number("friction", 2.0, low=0.0, high=100.0)

@@ -28,7 +28,7 @@ from undertow.estimators import Belief
 from undertow.law import Plan, ReferenceMotion, first_surface
 from undertow.law.inner_loop import InnerLoop
 from undertow.models import FloatArray, Mechanism, number_of
-from undertow.objective import Objective
+from undertow.objective import USUAL, Objective
 from undertow.plants import RealisticRig
 from undertow.runtime import Answer, Request, Settings, Worker, background_worker
 from undertow.runtime.processes import Background
@@ -42,8 +42,8 @@ from undertow.studies.live.planner import Job, Task, cascade_for, planner
 #: Period of the fast loop, s.
 STEP = 0.001
 
-#: Δt between re-optimisations at the start, s, and the objective.
-DELTA, GOAL = 0.1, "bench-energy"
+#: Δt between re-optimisations at the start, s.
+DELTA = 0.1
 
 #: Seconds of motion in a second that can be chosen.
 SPEEDS = (1.0, 0.5, 0.2, 0.05)
@@ -136,7 +136,7 @@ class Simulation:
         figure: Sketch,
         x0: ArrayLike | None = None,
         *,
-        objective: str = GOAL,
+        objective: str = USUAL,
         period: float = DELTA,
         seed: int = 0,
         worker: Worker[Request, Answer] | None = None,
