@@ -32,6 +32,7 @@ from undertow.cli.parsing import (
     parse_start,
     parse_surface,
     parse_target,
+    parse_values,
 )
 from undertow.cli.terminal import progress_bar, show
 from undertow.closed_loop import Event, Trajectory
@@ -763,3 +764,10 @@ def test_a_port_that_is_none_is_refused_before_the_page_is_made() -> None:
     assert code == 2
     assert "65535" in err
     assert "making ready" not in err
+
+
+def test_a_unit_that_is_typed_is_not_said_to_be_wanted_in_si() -> None:
+    """Claim: the refusal asks for the unit that the mechanism gives, which need not be SI (kN)."""
+    with pytest.raises(InvalidInputError, match="unit that the mechanism gives") as refused:
+        parse_values(["drive=5kN"], "limit of input")
+    assert "SI" not in str(refused.value)

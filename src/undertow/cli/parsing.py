@@ -152,7 +152,7 @@ def _number(text: str, what: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        remedy = "Write the number alone: quantities that are set are in SI units"
+        remedy = "Write the number alone, in the unit that the mechanism gives for it"
         raise InvalidInputError(what, value=repr(text), limit="a finite number", remedy=remedy)
     return value
 
