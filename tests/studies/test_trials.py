@@ -373,20 +373,28 @@ def test_the_cascade_bears_a_knock_that_its_soft_surfaces_do_not() -> None:
 
 @pytest.mark.slow
 def test_the_cascade_bears_dry_friction_that_its_soft_surfaces_do_not() -> None:
-    """Fifteen times the bench's: the arm is held, where it swayed and drifted before."""
+    """Fifteen times the bench's: the arm is held, where it swayed and drifted before.
+
+    On all but one of six rigs: it is at the end of what is borne, and one in a dozen still sways.
+    """
     bench = srv02_rig()
     belief = bench.mechanism
     x0 = belief.state(phi=math.radians(35))
     objective = objective_for(belief, "bench-energy")
     make = controllers(belief, bench, objective, x0)["cascade"]
     rough = bench.with_friction(15.0, ("theta",))
-    estimator = estimator_for(belief, bench, known=ut.Belief.usual(belief))
-    outcome = trial(belief, rough, make, x0, 8.0, 2, objective=objective, estimator=estimator)
-    last = outcome.record.t > 6.0
-    assert outcome.caught
-    assert np.abs(outcome.record.truth[last, 0]).max() < math.radians(20)
-    assert estimator.learnt is not None
-    assert np.abs(estimator.learnt.offset).max() < 1.0
+    held = 0
+    for seed in range(6):
+        estimator = estimator_for(belief, bench, known=ut.Belief.usual(belief))
+        outcome = trial(
+            belief, rough, make, x0, 8.0, seed, objective=objective, estimator=estimator
+        )
+        last = outcome.record.t > 6.0
+        arm = np.abs(outcome.record.truth[last, 0]).max()
+        held += outcome.caught and bool(arm < math.radians(20))
+        assert estimator.learnt is not None
+        assert np.abs(estimator.learnt.offset).max() < 1.0
+    assert held >= 5
 
 
 def test_a_regulator_acts_about_the_input_that_holds_the_target(arm: ut.Mechanism) -> None:

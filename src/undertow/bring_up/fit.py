@@ -154,7 +154,7 @@ def candidates(mechanism: Mechanism, coulomb: float, record: MotionRecord) -> li
     what = "from a write to its effect in a reading"
     variables = [Quantity("delay", "s", what, 1e-3, 1e-3, high=0.1)]
     for i, c in enumerate(mechanism.coordinates):
-        unit = "N m" if c.unit == "rad" else "N"
+        unit = mechanism.force_units[i]
         size = 0.01 * float(levels[i]) if i < mechanism.m else coulomb
         what = f"dry friction of {c.name}"
         variables.append(Quantity(f"friction_{c.name}", unit, what, 0.3 * size, size))

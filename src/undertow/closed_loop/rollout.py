@@ -335,6 +335,7 @@ class ClosedLoop:
         """Return a copy with other fields, unchecked, and without some of what was computed."""
         assert self._kernels is not None  # found once, for all copies
         assert self.prices is not None
+        assert self.price_of_time >= 0
         assert self.substeps > 0
         other = object.__new__(type(self))
         other.__dict__.update(

@@ -410,7 +410,7 @@ class Mechanism:
         """
         positive("width of Coulomb friction, rad/s or m/s", width, "0.05 is usual")
         velocities = {c.name: c.velocity for c in self.coordinates}
-        units = {c.name: "N m" if c.unit == "rad" else "N" for c in self.coordinates}
+        units = {c.name: u for c, u in zip(self.coordinates, self.force_units, strict=True)}
         force, parameters = {}, []
         for name, bound in bounds.items():
             one_of(f"unknown coordinate of '{self.name}'", name, velocities)
@@ -518,6 +518,22 @@ class Mechanism:
     def substitution(self) -> dict[sp.Symbol, float]:
         """Parameter symbols to their values, for ``subs``."""
         return {p.symbol: p.value for p in self.parameters}
+
+    @property
+    def force_units(self) -> tuple[str, ...]:
+        """Unit of the generalised force of each coordinate: N, or N m about a hinge.
+
+        Or kN and kN m, where an input in kN acts on a coordinate as it is, with 1 in ``B``: masses
+        are tonnes then.
+        """
+        prefix = ""
+        for c, row in zip(self.coordinates, self.B, strict=False):
+            acting = np.flatnonzero(row)
+            own = "N m" if c.unit == "rad" else "N"
+            if len(acting) == 1 and abs(row[acting[0]]) == 1.0:
+                unit = self.inputs[acting[0]].unit
+                prefix = unit.removesuffix(own) if unit.endswith(own) else prefix
+        return tuple(prefix + ("N m" if c.unit == "rad" else "N") for c in self.coordinates)
 
     @property
     def input_limits(self) -> FloatArray:

@@ -269,13 +269,13 @@ class _Condition:
         """Return these figures of coordinate j with their units."""
         mechanism = self.mechanism
         coordinate, B, m = mechanism.coordinates[j], mechanism.B, mechanism.m
-        unit = "N m" if coordinate.unit == "rad" else "N"
         as_input, input_unit = math.nan, ""
         if j < m and np.count_nonzero(B - np.diag(np.diag(B))) == 0:
             as_input, input_unit = proved / abs(float(B[j, j])), mechanism.inputs[j].unit
         return DisturbanceBound(
-            coordinate.name, j < m, proved, refuted, unit, witness, as_input, input_unit
-        )
+            coordinate.name, j < m, proved, refuted, mechanism.force_units[j], witness, as_input,
+            input_unit,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -217,10 +217,9 @@ def _frictions(mechanism: Mechanism) -> list[Control]:
             lean[i] = 0.0
         if most > 0:
             most = float(f"{most:.2g}")
-            unit = "N m" if c.unit == "rad" else "N"
             made.append(
                 Control(f"friction {c.name}", f"dry friction of {c.name}", "plant", 0.0, 0.0, most,
-                        0.0, unit, main=i == 0)
+                        0.0, mechanism.force_units[i], main=i == 0)
             )  # fmt: skip
     return made
 
