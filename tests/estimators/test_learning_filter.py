@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import undertow as ut
+from support import rest_slow
 from undertow.base import InvalidInputError
 from undertow.closed_loop import ClosedLoop
 from undertow.estimators import Belief, KalmanFilter
@@ -222,17 +223,17 @@ def _knocked(
     return kalman, before, kalman.learnt.offset, off
 
 
-@pytest.mark.parametrize("knock", [pytest.param(-3.0, marks=pytest.mark.slow), 6.0, 1.2])
+@pytest.mark.parametrize("knock", rest_slow([-2.0, 6.0, 1.2, -3.0], 6.0, 1.2))
 def test_a_knock_is_a_jump_of_the_velocities_and_no_parameter(arm: Mechanism, knock: float) -> None:
     """Velocities are found within 5 ms; parameters move no farther than without the knock.
 
-    What 15 V do in 5 ms, 1.8 rad/s, is no reason to give up what was planned.
+    What 15 V do in 5 ms, 1.8 rad/s, and a little more is no reason to give up what was planned.
     """
     calm, before, after, off = _knocked(arm, 0.0)
     assert calm.jumps == 0
     usual = np.abs(after - before).max()
     kalman, before, after, off = _knocked(arm, knock)
-    assert kalman.jumps == (1 if abs(knock) > 1.8 else 0)
+    assert kalman.jumps == (1 if abs(knock) > 2.5 else 0)
     assert np.abs(off).max() < 0.3
     assert np.abs(after - before).max() < max(0.2, 2.0 * usual)
 

@@ -32,23 +32,6 @@ from undertow.base import InvalidInputError, ModelError, UndertowError
 from undertow.models import TIME, FloatArray, controllability
 from undertow.symbolic import Tape
 
-
-@pytest.mark.parametrize(
-    ("unit", "gain", "units"),
-    [("N", 1, ("N", "N m")), ("kN", -1, ("kN", "kN m")), ("kN", 1000, ("N", "N m")),
-     ("V", 1, ("N", "N m"))],
-)  # fmt: skip
-def test_forces_are_in_the_unit_of_an_input_that_acts_as_it_is(
-    unit: str, gain: int, units: tuple[str, ...]
-) -> None:
-    """Masses in tonnes, input in kN: no friction or disturbance is 1000 times what is printed."""
-    cart = ut.mechanisms.cart_pendulum()
-    inputs = (ut.Input("force", unit, 20.0),)
-    made = replace(cart, inputs=inputs, input_matrix=sp.Matrix([[gain]]))
-    assert made.force_units == units
-    assert made.with_friction(x=0.1).parameters[-1].unit == units[0]
-
-
 shapes = pytest.mark.parametrize(("n", "m"), rest_slow(SHAPES, *SHAPES[:-1]))
 
 
@@ -611,3 +594,19 @@ def test_a_matrix_of_what_it_may_not_hold_says_what_it_may() -> None:
     ):
         with pytest.raises(ModelError, match=word):
             ut.Mechanism("own", (x, p), (force,), **{"mass_matrix": mass, "force": f} | matrix)
+
+
+@pytest.mark.parametrize(
+    ("unit", "gain", "units"),
+    [("N", 1, ("N", "N m")), ("kN", -1, ("kN", "kN m")), ("kN", 1000, ("N", "N m")),
+     ("V", 1, ("N", "N m"))],
+)  # fmt: skip
+def test_forces_are_in_the_unit_of_an_input_that_acts_as_it_is(
+    unit: str, gain: int, units: tuple[str, ...]
+) -> None:
+    """Masses in tonnes, input in kN: no friction or disturbance is 1000 times what is printed."""
+    cart = ut.mechanisms.cart_pendulum()
+    inputs = (ut.Input("force", unit, 20.0),)
+    made = replace(cart, inputs=inputs, input_matrix=sp.Matrix([[gain]]))
+    assert made.force_units == units
+    assert made.with_friction(x=0.1).parameters[-1].unit == units[0]

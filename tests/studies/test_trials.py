@@ -28,7 +28,7 @@ from undertow.runtime import Recipe, Report
 from undertow.runtime.controller_defaults import estimator_for
 from undertow.studies.experiment import grouped
 from undertow.studies.ledger import Ledger
-from undertow.studies.trials import library, robustness
+from undertow.studies.trials import compare, library, robustness
 from undertow.studies.trials.balance import Balance, controllers
 from undertow.studies.trials.estimation import EstimatorRow
 from undertow.studies.trials.report import (
@@ -47,7 +47,14 @@ from undertow.studies.trials.steering import (
     keeping,
     predictive,
 )
-from undertow.studies.trials.trial import Outcome, Result, judge, spread, trial
+from undertow.studies.trials.trial import (
+    MakeController,
+    Outcome,
+    Result,
+    judge,
+    spread,
+    trial,
+)
 from undertow.studies.trials.upright import EngineResult, SwingResult
 
 
@@ -138,6 +145,30 @@ def test_a_cascade_is_tried_as_a_run_would_make_it(monkeypatch: pytest.MonkeyPat
     assert repr(begun[0].gate) == repr(suited.gate)
     np.testing.assert_array_equal(np.array(begun[0].covariance), np.array(suited.covariance))
     assert begun[1].reaching == own
+
+
+def test_plants_with_the_same_sensors_share_one_search(
+    arm: ut.Mechanism, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a cascade is made fit for is the same; another delay is another search."""
+    searched: list[Bench] = []
+
+    def found(cascade: ut.Cascade, bench: Bench, x0: FloatArray) -> tuple[MakeController, None]:
+        searched.append(bench)
+        return keeping(arm, ut.first_surface(arm)), None
+
+    monkeypatch.setattr(compare, "cascade_and_kept", found)
+    bench = srv02_rig()
+    plants: list[Bench | ut.Mechanism] = [
+        bench,
+        bench.with_friction(2.0),
+        bench.with_delay(0.003),
+        arm,
+        arm.with_parameters(m=0.1),
+    ]
+    table = ut.compare(arm, [ut.Cascade(arm)], plants=plants, seconds=0.01, phi=0.1)
+    assert len(table.rows) == len(plants)
+    assert len(searched) == 3
 
 
 def test_a_run_is_balanced_only_if_it_stays_so(arm: ut.Mechanism) -> None:

@@ -257,11 +257,11 @@ def estimate(h, q, u, block, size, lead, known):
             driven
         )
         move(part, x, then, n, m, disturbed, parameters, stage, total, qdd, viscous, driven)
-        moving, louder = learnt, stirred[0]
+        moving, louder = learnt, 0.0
         for i in range(m if disturbed else 0):
-            louder = max(louder, stirred[0] + abs(x[2 * n + i]) / limits[i])
+            louder = max(louder, abs(x[2 * n + i]) / limits[i])
         for i in range(n):
-            if abs(base[i]) > excited[i] * (1.0 + louder / {EXCITED}):
+            if abs(base[i]) > excited[i] * (1.0 + (stirred[0] + louder) / {EXCITED}):
                 moving = size
         predict_covariance(F, P, A, noise, part, moving)
     for i in range(n):
@@ -425,7 +425,8 @@ class KalmanFilter(Estimator):
         memory["noise"][n : 2 * n] = unknown**2
         memory["noise"][2 * n : self._learnt] = disturbance_drift**2
         memory["limits"][:] = self._limits = mechanism.input_limits
-        memory["knock"][:] = KNOCK * full_accelerations(mechanism)
+        full = full_accelerations(mechanism)
+        memory["knock"][:] = KNOCK * full
         self.parameters = memory["parameters"]
         if belief is not None:
             memory["noise"][self._learnt :] = parameter_drift**2
@@ -433,7 +434,7 @@ class KalmanFilter(Estimator):
             memory["nominal"][:] = mechanism.parameter_values[belief.places]
             memory["tolerance"][:] = list(belief.tolerances.values())
             memory["reach"][:] = belief.room
-            memory["excited"][:] = EXCITED * full_accelerations(mechanism)
+            memory["excited"][:] = EXCITED * full
         self.belief = belief
         self._state: FloatArray = self._out[: 2 * n]
         if disturbance_drift > 0:

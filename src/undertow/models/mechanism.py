@@ -526,14 +526,13 @@ class Mechanism:
         Or kN and kN m, where an input in kN acts on a coordinate as it is, with 1 in ``B``: masses
         are tonnes then.
         """
-        prefix = ""
-        for c, row in zip(self.coordinates, self.B, strict=False):
+        own, prefix = ["N m" if c.unit == "rad" else "N" for c in self.coordinates], ""
+        for unit, row in zip(own, self.B, strict=False):
             acting = np.flatnonzero(row)
-            own = "N m" if c.unit == "rad" else "N"
             if len(acting) == 1 and abs(row[acting[0]]) == 1.0:
-                unit = self.inputs[acting[0]].unit
-                prefix = unit.removesuffix(own) if unit.endswith(own) else prefix
-        return tuple(prefix + ("N m" if c.unit == "rad" else "N") for c in self.coordinates)
+                given = self.inputs[acting[0]].unit
+                prefix = given.removesuffix(unit) if given.endswith(unit) else prefix
+        return tuple(prefix + unit for unit in own)
 
     @property
     def input_limits(self) -> FloatArray:

@@ -99,15 +99,14 @@ def for_rig(cascade: Cascade, estimator: Estimator) -> Cascade:
     The gate becomes :func:`default_gate`, the reaching law :func:`reaching_for`, the covariance
     that of the estimator's noise; what was chosen stays.
     """
-    chosen = cascade.reaching != ReachingLaw()
-    return replace(
-        cascade,
-        gate=default_gate(estimator) if cascade.gate is cost_gate else cascade.gate,
-        reaching=cascade.reaching if chosen else reaching_for(estimator),
-        covariance=estimator.noise_covariance()
-        if cascade.covariance is None
-        else cascade.covariance,
-    )
+    gate, reaching, covariance = cascade.gate, cascade.reaching, cascade.covariance
+    if gate is cost_gate:
+        gate = default_gate(estimator)
+    if reaching == ReachingLaw():
+        reaching = reaching_for(estimator)
+    if covariance is None:
+        covariance = estimator.noise_covariance()
+    return replace(cascade, gate=gate, reaching=reaching, covariance=covariance)
 
 
 def reaching_for(estimator: Estimator) -> ReachingLaw:

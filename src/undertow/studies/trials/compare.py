@@ -206,13 +206,16 @@ def compare(
         objective = next((c.objective for c in named.values() if isinstance(c, Cascade)), None)
     outcomes = {}
     for name, controller in named.items():
+        makers: dict[object, MakeController] = {}
         for place, plant in meets.items():
             bench = Bench(plant) if isinstance(plant, Mechanism) else plant
             mechanism.check_plant(bench.mechanism)
-            make = _maker(mechanism, controller, bench, start)
+            told = bench.timing, frozenset(bench.encoders.items())  # one search for all alike
+            if told not in makers:
+                makers[told] = _maker(mechanism, controller, bench, start)
             known = controller.known if isinstance(controller, Cascade) else Belief.usual(mechanism)
             outcomes[name, place] = trial(
-                mechanism, bench, make, start, seconds, seed,
+                mechanism, bench, makers[told], start, seconds, seed,
                 objective=objective, estimator=estimator_for(mechanism, bench, known=known),
             )  # fmt: skip
     return Comparison(outcomes, "" if objective is None else objective.on(mechanism).unit)
