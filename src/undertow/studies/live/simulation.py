@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -146,8 +147,8 @@ class Simulation:
         self._x0 = mechanism.initial_state(x0, {})
         self.controls = controls_of(mechanism, objective, period)
         # What cannot be is refused here, not in another process.
-        cascade = cascade_for(mechanism, self.controls.task, seed)
-        cascade.objective.check_start(mechanism, self._x0)
+        self._cascade = lru_cache(maxsize=4)(lambda task: cascade_for(mechanism, task, seed))
+        self._cascade(self.controls.task).objective.check_start(mechanism, self._x0)
         self._belief = Belief.usual(mechanism)
         far = float(np.abs(self._x0[: mechanism.n]).max())
         self._fastest = mechanism.linearise().fastest
@@ -344,7 +345,7 @@ class Simulation:
     def _spend(self, error: FloatArray, u: FloatArray) -> None:
         word = self._task.objective
         if word not in self._costs:
-            objective = cascade_for(self.mechanism, self._task).objective
+            objective = self._cascade(self._task).objective
             self._costs[word] = objective, objective.stage_function(self.mechanism)
         objective, stage_of = self._costs[word]
         if np.linalg.norm(error) > objective.terminal_radius:
@@ -500,7 +501,8 @@ class Simulation:
         if tuple(self.law.mechanism.input_limits) != limits:
             self._limit(limits)
         self.law.lane = answer.law_vectors[0]
-        self.law.surface = memory.surface
+        self.law.surface, reaching = memory.plan.at(0.0)
+        self.law.reaching = reaching or self._cascade(self._task).reaching
         if memory.estimate is not None:
             self.law.believe(
                 self._belief.values(memory.estimate.offset), self._error(self.rig.truth)
@@ -515,6 +517,25 @@ class Simulation:
         why, jumped, _ = answer.admission.reason.partition("; the state is")
         self._anew = self._anew or bool(jumped)
         self._decide(answer, answer.admission.accepted, first or why)
+
+    def _take_reserve(self) -> None:
+        """Go on with the strongest plan in reserve, as on a rig whose velocities have jumped.
+
+        The plan in use was chosen for where it was, at rest for hardly any cost, and may lose what
+        is pushed before the next one comes.
+        """
+        if self.memory is None or self.mode != RUNNING:
+            return
+        cascade, error = self._cascade(self._task), self._error(self.rig.truth)
+        plan = cascade.reserve[-1]
+        before, lane = self.law.reaching, self.law.lane
+        self.law.use(*plan.at(0.0))
+        self.law(error)
+        if self.law.margin[0] > self._settings.min_margin:
+            self.memory = replace(self.memory, plan=plan, since=self.t)
+        else:
+            self.law.lane, self.law.reaching = lane, before
+            self.law.surface = self.memory.surface
 
     def _decide(self, answer: Answer, accepted: bool, why: str) -> None:
         """Say what has become of an answer."""
@@ -632,6 +653,7 @@ class Simulation:
         impulse = np.zeros(n)
         impulse[-1] = side * change / inverse[-1, -1]
         self.rig.knock(impulse)
+        self._take_reserve()
         self._touched, self._due = True, self.t
         self._end_bound()
 
