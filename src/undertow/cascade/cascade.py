@@ -297,6 +297,24 @@ class Cascade:
         """Plans that are there without a search: the first surface, reached ever more strongly."""
         return self._reserve.plans
 
+    @checked
+    def prepared(self, state: CascadeState, x: ArrayLike) -> CascadeState:
+        """Choose what takes over when velocities jump, by rollouts; return it with the memory.
+
+        Candidates are the plan in use, the first optimum from x, (2n,), and those of
+        :attr:`reserve`.  Who steers a plant that may be pushed asks for it once, before the run.
+        """
+        error = state.error(state.since, self.mechanism.check_state(x))
+        known, belief = state.estimate, self.predictions.belief
+        loop = self.predictions.plausible(known)
+        if belief is not None and known is not None:
+            loop = loop.believing(loop.mechanism, belief.single(known))
+        return replace(state, after_jump=self._reserve.after_jump(loop, state.plan, error))
+
+    def after_jump(self, state: CascadeState) -> Plan:
+        """Return the plan that takes over when velocities jump, see :meth:`prepared`."""
+        return state.after_jump or self.reserve[-1]
+
     @cached_property
     def _judge(self) -> Judge:
         return Judge(self.predictions, self._reserve, self.gate, self.objective, self.recourse)

@@ -19,6 +19,10 @@ STRONGER = (1.0, 2.0, 4.0, 8.0)
 #: another is in use: what has to hurry in the end costs much more than what is mended sooner.
 ROOM = 0.8
 
+#: Impulses after which plans are compared, on each coordinate and either way: parts of what would
+#: carry it, at the rate of the fastest mode, as far as the start is.
+JUMPS = (0.25, 0.5)
+
 
 class Reserve:
     """The first surface, reached ever more strongly.
@@ -63,6 +67,25 @@ class Reserve:
         ranks[0] = (scores[0] >= INADMISSIBLE, sticks, scores[0])
         best = min(range(len(ranks)), key=ranks.__getitem__)
         return self.plans[best - 1] if best else None
+
+    def after_jump(self, loop: ClosedLoop, first: Plan, error: FloatArray) -> Plan:
+        """The plan to go on with when velocities have jumped: the first optimum, or one of these.
+
+        It is the one that brings home from most of the ``JUMPS`` at rest, and of those the cheapest
+        in sum.  The plan in use is none of them: at rest that was chosen for hardly any cost, and
+        what it does elsewhere nobody asked.
+        """
+        mechanism, n = loop.mechanism, loop.mechanism.n
+        far = float(np.abs(error[:n]).max())
+        if not far > 0:
+            return self.plans[-1]
+        inverse = np.linalg.inv(mechanism.M(np.zeros(n)))
+        jump = mechanism.linearise().fastest * far * (inverse / np.diag(inverse)).T
+        knocks = np.zeros((2 * len(JUMPS) * n, 2 * n))
+        knocks[:, n:] = np.vstack([sign * part * jump for part in JUMPS for sign in (1, -1)])
+        plans, span = [*reversed(self.plans), first], loop.objective.horizon
+        costs = [float(loop.batch(knocks, plan).score(span).sum()) for plan in plans]
+        return plans[int(np.argmin(costs))]
 
     def recovers(self, loop: ClosedLoop, error: FloatArray, span: float, plan: Plan) -> bool:
         """Whether a plan may be in use as far as every plausible plant is concerned.

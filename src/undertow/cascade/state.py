@@ -21,7 +21,8 @@ class CascadeState:
     ``target`` where the target is, where it is not at x = 0: ``x`` is counted from it;
     ``disturbance`` how large a matched disturbance is, in the inputs' units, (m,), where it is
     estimated; ``ahead`` what will be best for the estimate at the decision after the first, a plan
-    from then on, which that begins with.
+    from then on, which that begins with; ``after_jump`` what takes over when the velocities jump,
+    see :meth:`.Cascade.prepared`.
     """
 
     plan: Plan
@@ -34,6 +35,7 @@ class CascadeState:
     target: ReferenceMotion | None = None
     disturbance: tuple[float, ...] = ()
     ahead: Plan | None = None
+    after_jump: Plan | None = None
 
     @property
     def surface(self) -> Surface:

@@ -262,7 +262,7 @@ class Controller:
         return self._jumps > before and self.mode in (Mode.CATCH, Mode.BALANCE)
 
     def _take_reserve(self, t: float) -> None:
-        """Have the next step go on with the strongest plan in reserve; another one comes soon.
+        """Have the next step go on with the plan in reserve; another one comes soon.
 
         What was asked for before is for a motion that is no more.  A plan for another target, which
         takes a while, is waited for.
@@ -275,7 +275,7 @@ class Controller:
         if asked is not None:
             self._close(asked.sequence)
         number, use = self._sequence + 1, t + self.period
-        plan = self.cascade.reserve[-1]
+        plan = self.cascade.after_jump(self.memory)
         before, why = self.memory, "a plan in reserve: the velocities have jumped"
         memory = replace(before, plan=plan, since=use, sequence=number, x=())
         proposal = Proposal(plan, "budget spent", math.inf, math.inf, (), 0, 0.0, number, use)

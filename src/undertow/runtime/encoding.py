@@ -258,10 +258,11 @@ def memory_from(value: Mapping[str, Any], reference: ReferenceMotion | None = No
         raise ValueError("a target that moves, in a run without one")
     if q is not None and q != MOVING:
         target = ReferenceMotion.at_rest(np.array(q, dtype=float))
-    learnt, ahead = value.get("estimate"), value.get("ahead")
+    learnt = value.get("estimate")
+    plans = {name: value.get(name) for name in ("ahead", "after_jump")}
     changed = {
         "plan": _plan_from(value["plan"]),
-        "ahead": None if ahead is None else _plan_from(ahead),
+        **{name: None if plan is None else _plan_from(plan) for name, plan in plans.items()},
         "x": x,
         "target": target,
         "estimate": None if learnt is None else _estimate_from(learnt),

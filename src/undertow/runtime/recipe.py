@@ -283,8 +283,11 @@ class Recipe:
         if self.swing is not None:
             return CascadeState(Plan.of(self.swing.region.surfaces[0]))
         if self.legs:
-            return self.cascade.start_to(self.belief.check_state(self.x0), self.legs[0][1])[0]
-        return self.cascade.start(self.x0)[0]
+            x = self.belief.check_state(self.x0)
+            state = self.cascade.start_to(x, self.legs[0][1])[0]
+        else:
+            state = self.cascade.start(self.x0)[0]
+        return self.cascade.prepared(state, self.x0)
 
     def respond(self, request: Request) -> Answer:
         """Answer a request of the fast loop: what the slow loop computes."""

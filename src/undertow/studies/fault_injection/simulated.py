@@ -220,7 +220,7 @@ def drill(
     each.
     """
     recipe = drill_recipe(seed)
-    memory, _ = recipe.cascade.start(recipe.x0)
+    memory = recipe.first()
     outcomes = []
     for case in each(cases, progress, lambda case: f"{case.part}: {case.name}"):
         with tempfile.TemporaryDirectory() as folder:

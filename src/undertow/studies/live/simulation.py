@@ -519,7 +519,7 @@ class Simulation:
         self._decide(answer, answer.admission.accepted, first or why)
 
     def _take_reserve(self) -> None:
-        """Go on with the strongest plan in reserve, as on a rig whose velocities have jumped.
+        """Go on with the plan in reserve, as on a rig whose velocities have jumped.
 
         The plan in use was chosen for where it was, at rest for hardly any cost, and may lose what
         is pushed before the next one comes.
@@ -527,9 +527,10 @@ class Simulation:
         if self.memory is None or self.mode != RUNNING:
             return
         cascade, error = self._cascade(self._task), self._error(self.rig.truth)
-        plan = cascade.reserve[-1]
+        plan = cascade.after_jump(self.memory)
         before, lane = self.law.reaching, self.law.lane
-        self.law.use(*plan.at(0.0))
+        surface, reaching = plan.at(0.0)
+        self.law.use(surface, reaching or cascade.reaching)
         self.law(error)
         if self.law.margin[0] > self._settings.min_margin:
             self.memory = replace(self.memory, plan=plan, since=self.t)

@@ -99,8 +99,8 @@ class CascadeSteering:
         self.law.follow(self.memory.plan, t - self.memory.since, self.cascade.reaching)
 
     def _take_reserve(self, t: float, x: FloatArray) -> None:
-        """Go on with the strongest plan in reserve, where its law exists."""
-        plan = self.cascade.reserve[-1]
+        """Go on with the plan in reserve, where its law exists."""
+        plan = self.cascade.after_jump(self.memory)
         self.law.follow(plan, 0.0, self.cascade.reaching)
         self.law(x)
         if self.law.margin[0] > Settings().min_margin:
@@ -143,7 +143,8 @@ def cascade_and_kept(
     """
     known = estimator_for(cascade.mechanism, bench, known=cascade.known)
     suited = for_rig(cascade, known)
-    start = suited.start(x0)
+    state, proposal = suited.start(x0)
+    start = suited.prepared(state, x0), proposal
     kept = keeping(suited.mechanism, start[0].surface, suited.reaching)
     return lambda _: CascadeSteering(suited, start), kept
 
