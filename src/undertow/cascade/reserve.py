@@ -21,7 +21,7 @@ ROOM = 0.8
 
 #: Impulses after which plans are compared, on each coordinate and either way: parts of what would
 #: carry it, at the rate of the fastest mode, as far as the start is.
-JUMPS = (0.25, 0.5)
+JUMPS = (0.25, 0.5, 1.0)
 
 
 class Reserve:
@@ -84,8 +84,12 @@ class Reserve:
         knocks = np.zeros((2 * len(JUMPS) * n, 2 * n))
         knocks[:, n:] = np.vstack([sign * part * jump for part in JUMPS for sign in (1, -1)])
         plans, span = [*reversed(self.plans), first], loop.objective.horizon
-        costs = [float(loop.batch(knocks, plan).score(span).sum()) for plan in plans]
-        return plans[int(np.argmin(costs))]
+        ranks = []
+        for plan in plans:
+            scores = loop.batch(knocks, plan).score(span)
+            lost = scores >= INADMISSIBLE
+            ranks.append((int(lost.sum()), float(scores[~lost].sum())))
+        return plans[min(range(len(plans)), key=ranks.__getitem__)]
 
     def recovers(self, loop: ClosedLoop, error: FloatArray, span: float, plan: Plan) -> bool:
         """Whether a plan may be in use as far as every plausible plant is concerned.
