@@ -14,7 +14,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -151,7 +151,7 @@ def test_every_button_and_key_does_what_it_says(page: Any) -> None:
     page.select_option("#speed", "1")
     until(page, "undertow.state.speed === 1")
     # Pushed at rest: the arm goes after the rod, which turns for less than a picture.
-    followed = {
+    followed: dict[str, Callable[[], None]] = {
         "< -0.4": lambda: page.click("#right"),
         "> 0.4": lambda: page.keyboard.press("ArrowLeft"),
     }
