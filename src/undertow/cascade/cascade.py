@@ -305,10 +305,8 @@ class Cascade:
         :attr:`reserve`.  Who steers a plant that may be pushed asks for it once, before the run.
         """
         error = state.error(state.since, self.mechanism.check_state(x))
-        known, belief = state.estimate, self.predictions.belief
-        loop = self.predictions.plausible(known)
-        if belief is not None and known is not None:
-            loop = loop.believing(loop.mechanism, belief.single(known))
+        known = state.estimate
+        loop = self.predictions.single(known) or self.predictions.plausible(known)
         return replace(state, after_jump=self._reserve.after_jump(loop, state.plan, error))
 
     def after_jump(self, state: CascadeState) -> Plan:

@@ -106,9 +106,7 @@ class Planning:
         check_held(predictions.prior)
         # Where nothing suits every plausible plant, what brings home the estimate, without room for
         # any error: to learn which of the plants it is takes less time than to fall.
-        single = None
-        if belief is not None and known is not None:
-            single = whole.believing(whole.mechanism, belief.single(known))
+        single = predictions.single(known)
         last = [] if single is None else [Search(single)]
         tries: list[Found] = []
         for loop, fixed, repairs in [*self._searches(known), *last]:

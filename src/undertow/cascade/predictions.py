@@ -44,6 +44,16 @@ class Predictions:
             return prior
         return prior.believing(belief.believed(estimate), belief.ensemble(estimate))
 
+    def single(self, estimate: ParameterEstimate | None) -> ClosedLoop | None:
+        """The plausible loop with the estimate for its only member; ``None``: nothing is open.
+
+        It needs nothing compiled that the ensemble has not.
+        """
+        if self.belief is None or estimate is None:
+            return None
+        whole = self.plausible(estimate)
+        return whole.believing(whole.mechanism, self.belief.single(estimate))
+
     def _estimated(self, estimate: ParameterEstimate | None) -> ClosedLoop:
         """The loop of an estimate taken for the plant."""
         return self._alone.believing(self.plausible(estimate).mechanism)

@@ -282,11 +282,8 @@ class Recipe:
         """
         if self.swing is not None:
             return CascadeState(Plan.of(self.swing.region.surfaces[0]))
-        if self.legs:
-            x = self.belief.check_state(self.x0)
-            state = self.cascade.start_to(x, self.legs[0][1])[0]
-        else:
-            state = self.cascade.start(self.x0)[0]
+        target = self.legs[0][1] if self.legs else None
+        state, _ = self.cascade.start_to(self.belief.check_state(self.x0), target)
         return self.cascade.prepared(state, self.x0)
 
     def respond(self, request: Request) -> Answer:
