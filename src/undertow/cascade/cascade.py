@@ -309,6 +309,7 @@ class Cascade:
         loop = self.predictions.single(known) or self.predictions.plausible(known)
         return replace(state, after_jump=self._reserve.after_jump(loop, state.plan, error))
 
+    @checked
     def after_jump(self, state: CascadeState) -> Plan:
         """Return the plan that takes over when velocities jump, see :meth:`prepared`."""
         return state.after_jump or self.reserve[-1]
