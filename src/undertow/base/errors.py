@@ -109,10 +109,7 @@ class ResourceError(UndertowError, OSError):
 def or_refused(what: str, limit: str, remedy: str) -> Iterator[None]:
     """Turn what the system refuses about a file into one condition.
 
-    Raises
-    ------
-    ArtefactError
-        With the system's own words.
+    Raises ArtefactError with the system's own words.
     """
     try:
         yield

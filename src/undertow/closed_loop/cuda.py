@@ -82,12 +82,8 @@ def on_gpu(loop: ClosedLoop, compiler: Literal["nvrtc", "host"] = "nvrtc") -> Cl
 class CudaText:
     """The kernel of a closed loop as CUDA C++, and how it is called.
 
-    Attributes
-    ----------
-    text
-        The module; its entry is ``rollout_all(count, …)``.
-    shapes
-        Lengths that follow the parameters: (array, axis).
+    ``text``: the module; its entry is ``rollout_all(count, …)``. ``shapes``: lengths that follow
+    the parameters: (array, axis).
     """
 
     def __init__(self, loop: ClosedLoop) -> None:

@@ -671,10 +671,8 @@ def _stable_inversion(
 ) -> None:
     """Fill in the unactuated columns of q, v and a, (N, n), with what the actuated ones leave.
 
-    Raises
-    ------
-    InvalidInputError
-        Where there is no bounded motion, or the reference is too fast to find it.
+    Raises InvalidInputError where there is no bounded motion, or the reference is too fast to find
+    it.
     """
     m = mechanism.m
     linear = linearise(mechanism)

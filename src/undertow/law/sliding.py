@@ -365,12 +365,7 @@ def gamma_determinant(X: FloatArray, surfaces: FloatArray) -> FloatArray:
 def singularity(mechanism: Mechanism, surfaces: FloatArray, q: ArrayLike) -> FloatArray:
     """Return det(α_a − α_u M_uu⁻¹ M_auᵀ) at positions q, broadcast over surface vectors.
 
-    Parameters
-    ----------
-    surfaces
-        Surface vectors, (…, 2mn).
-    q
-        Positions, (…, n); leading shapes broadcast.
+    ``surfaces``: surface vectors, (…, 2mn). ``q``: positions, (…, n); leading shapes broadcast.
     """
     return gamma_determinant(coupling(mechanism, q), surfaces)
 

@@ -147,10 +147,7 @@ def _turned(mechanism: Mechanism, x: FloatArray) -> str:
 def check_held(loop: ClosedLoop) -> None:
     """Refuse a target that the inputs cannot hold: no start comes home to stay.
 
-    Raises
-    ------
-    InfeasibleError
-        With the input, what it would have to be there, and its limit.
+    Raises InfeasibleError with the input, what it would have to be there, and its limit.
     """
     held = np.abs(holding_input(loop.mechanism))
     for given, u, limit in zip(loop.mechanism.inputs, held, loop.input_limits, strict=True):

@@ -149,10 +149,7 @@ def recorded_recipe(
 ) -> tuple[Recipe, tuple[str, ...]]:
     """Return the recipe that a log carries, and what else is to be known of it, in sentences.
 
-    Raises
-    ------
-    ArtefactError
-        As for :func:`replay`.
+    Raises ArtefactError as for :func:`replay`.
     """
     path = recording.path
     if isinstance(mechanism, str):

@@ -87,12 +87,8 @@ def model_files(
     """Return the experiment that reads every URDF and MJCF file below a folder.
 
     Links are not followed. ``simulate`` balances what can be as ``undertow simulate FILE`` does:
-    for the usual objective, from the usual start; ``seed`` is the optimisers'.
-
-    Raises
-    ------
-    ArtefactError
-        Where there is no such folder, or nothing in it, or too much.
+    for the usual objective, from the usual start; ``seed`` is the optimisers'. Raises ArtefactError
+    where there is no such folder, or nothing in it, or too much.
     """
     if not folder.is_dir():
         raise ArtefactError(
@@ -209,10 +205,7 @@ def _kept(rows: Sequence[ModelFile]) -> list[ModelFile]:
 def refused_groups(rows: Sequence[ModelFile]) -> Iterator[tuple[str, str, str, int]]:
     """Gather the files below one folder that are refused alike.
 
-    Yields
-    ------
-    str, str, str, int
-        The first files, what their refusal is about, the first one's reason, how many there are.
+    Yields the first files, what their refusal is about, the first one's reason, how many there are.
     """
 
     def alike(row: ModelFile) -> tuple[str, str, str]:

@@ -37,11 +37,8 @@ FAR = 1e9
 def exact_region(mechanism: Mechanism, region: Box) -> dict[str, tuple[Fraction, Fraction]]:
     """Return the rational numbers that the ends of a region of positions are.
 
-    Raises
-    ------
-    InvalidInputError
-        For an unknown coordinate or an interval that is empty, not finite or leaves out
-        the target, from which the non-singular set must be connected.
+    Raises InvalidInputError for an unknown coordinate or an interval that is empty, not finite or
+    leaves out the target, from which the non-singular set must be connected.
     """
     names = [c.name for c in mechanism.coordinates]
     for name, (low, high) in region.items():

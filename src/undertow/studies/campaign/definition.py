@@ -119,10 +119,7 @@ class Definition:
 def _of_data(name: str, definition: Path) -> str:
     """Return the whole name of a mechanism that a definition names; files may lie beside it.
 
-    Raises
-    ------
-    InvalidInputError
-        For one in a Python file.
+    Raises InvalidInputError for one in a Python file.
     """
     if in_a_file(name):
         raise InvalidInputError(

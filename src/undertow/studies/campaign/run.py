@@ -64,10 +64,7 @@ _BUILDING, _COMPUTING = threading.RLock(), threading.Lock()
 def study_of(definition: Definition) -> Study:
     """Return the study that a definition means; the same object as long as it is in use.
 
-    Raises
-    ------
-    InvalidInputError
-        For a setting that is unknown or out of bounds.
+    Raises InvalidInputError for a setting that is unknown or out of bounds.
     """
     with _BUILDING:
         settings = definition.settings

@@ -134,12 +134,8 @@ def cascade_and_kept(
 ) -> tuple[MakeController, MakeController]:
     """Return the makers of the cascade and of its first optimum, kept: one search from x0, (2n,).
 
-    Both are as :func:`undertow.runtime.for_rig` makes them for what is told of the bench.
-
-    Raises
-    ------
-    InfeasibleError
-        When the first optimisation finds no admissible surface.
+    Both are as :func:`undertow.runtime.for_rig` makes them for what is told of the bench. Raises
+    InfeasibleError when the first optimisation finds no admissible surface.
     """
     known = estimator_for(cascade.mechanism, bench, known=cascade.known)
     suited = for_rig(cascade, known)
@@ -155,14 +151,9 @@ class NMPC:
     The objective gives the stage cost, its quadratic part the terminal cost; inputs count from the
     one that holds the target. A solution is made every ``period``, s, by at most ``iterations`` of
     the interior-point method, for a ``horizon``, s, in which an input is held for ``step``, s, at a
-    time.
-
-    Raises
-    ------
-    InvalidInputError
-        For a stage cost that does not rise with every input, such as least time.
-    ModelError
-        For one with kinks, and where no linear feedback stabilises the mechanism.
+    time. Raises InvalidInputError for a stage cost that does not rise with every input, such as
+    least time; ModelError for one with kinks, and where no linear feedback stabilises the
+    mechanism.
     """
 
     def __init__(
@@ -300,11 +291,7 @@ def clipped_regulator(belief: Mechanism, free: float = 10.0) -> MakeController:
     """Return a linear-quadratic regulator, its output clipped: Q of the first surface.
 
     It acts about the input that holds the target.  ``free`` is the weight of the free coordinates.
-
-    Raises
-    ------
-    ModelError
-        Where no linear feedback stabilises the mechanism.
+    Raises ModelError where no linear feedback stabilises the mechanism.
     """
     lin, rest = linearise(belief), holding_input(belief)
     n, m = belief.n, belief.m
