@@ -82,12 +82,7 @@ def floats(what: str, values: ArrayLike, remedy: str = BY_NAME) -> np.typing.NDA
     """
     if _is_array(values) and not np.ma.is_masked(values):  # NumPy would hand over what is hidden
         return np.asarray(values, dtype=np.float64)
-    raise InvalidInputError(
-        what,
-        value=_shown(values),
-        limit="numbers, in SI units",
-        remedy=remedy,
-    )
+    raise InvalidInputError(what, value=_shown(values), limit="numbers, in SI units", remedy=remedy)
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:

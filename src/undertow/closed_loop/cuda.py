@@ -18,13 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from undertow.base import (
-    ArtefactError,
-    MissingExtraError,
-    ResourceError,
-    checked,
-    require_extra,
-)
+from undertow.base import ArtefactError, MissingExtraError, ResourceError, checked, require_extra
 from undertow.closed_loop.kernel import build_loop_graph
 from undertow.closed_loop.kernel_source import kernel_source
 from undertow.closed_loop.rollout import ClosedLoop

@@ -279,11 +279,7 @@ class _LawFunction:
         law = build_law_graph(
             mechanism.partition(tape), mechanism.x, symbols, switching, mechanism.disturbance_bounds
         )
-        inputs = [
-            *mechanism.x,
-            *symbols.vector,
-            *mechanism.parameter_symbols,
-        ]
+        inputs = [*mechanism.x, *symbols.vector, *mechanism.parameter_symbols]
         self.run = compile_numpy(tape, inputs, [*law.u, *law.s, *law.gains, law.margin])
 
     def __call__(

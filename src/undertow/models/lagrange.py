@@ -52,10 +52,7 @@ def derived(
 
 
 def quadratic_form(
-    name: str,
-    kinetic: sp.Expr,
-    qd: Sequence[sp.Symbol],
-    tidy: Callable[[sp.Expr], sp.Expr],
+    name: str, kinetic: sp.Expr, qd: Sequence[sp.Symbol], tidy: Callable[[sp.Expr], sp.Expr]
 ) -> sp.Matrix:
     """Return M = ∂²T/∂q̇², (n, n), of tidy entries, where T is ½ q̇ᵀ M(q) q̇.
 

@@ -222,9 +222,7 @@ def _refusal(error: Exception) -> UndertowError:
     if isinstance(error, UndertowError) and hasattr(errors, type(error).__name__):
         return error
     return ArtefactError(
-        "rig of a supervisor",
-        value=error_text(error),
-        limit="a rig that can be made and read",
+        "rig of a supervisor", value=error_text(error), limit="a rig that can be made and read"
     )
 
 

@@ -250,7 +250,4 @@ def files_of(rows: Sequence[ModelFile]) -> dict[str, bytes]:
     text = [summary(rows), "", *markdown_table(HEADS, map(_cells, _kept(rows)), ("n", "m")), ""]
     refused = ((names, count, about, why) for names, about, why, count in refused_groups(rows))
     text += [line.replace("<", "&lt;") for line in markdown_table(REFUSED, refused, ("number",))]
-    return {
-        "models.csv": to_csv(columns, data),
-        "models.md": ("\n".join(text) + "\n").encode(),
-    }
+    return {"models.csv": to_csv(columns, data), "models.md": ("\n".join(text) + "\n").encode()}

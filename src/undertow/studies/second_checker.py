@@ -64,9 +64,7 @@ def agree(first: str, second: str) -> bool:
 
 
 def agreement_table(
-    kinds: Sequence[str],
-    first: Sequence[tuple[str, float]],
-    second: Sequence[tuple[str, float]],
+    kinds: Sequence[str], first: Sequence[tuple[str, float]], second: Sequence[tuple[str, float]]
 ) -> tuple[Table, bool]:
     """Return a table for the terminal, claim by claim, and whether both checkers agree on all.
 

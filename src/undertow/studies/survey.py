@@ -23,15 +23,7 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from undertow.base import (
-    InfeasibleError,
-    finite,
-    manifest,
-    markdown_table,
-    number,
-    table,
-    to_csv,
-)
+from undertow.base import InfeasibleError, finite, manifest, markdown_table, number, table, to_csv
 from undertow.bounds import bound
 from undertow.cascade import Cascade, Run, gate_words
 from undertow.closed_loop.figures import state_words
@@ -203,11 +195,7 @@ def _total(run: Run | None) -> float:
 
 
 def _bound(
-    mechanism: Mechanism,
-    objective: Objective,
-    x0: FloatArray,
-    runs: Sequence[Run],
-    longest: float,
+    mechanism: Mechanism, objective: Objective, x0: FloatArray, runs: Sequence[Run], longest: float
 ) -> float:
     """Return the bound, NaN where none was found; the cascades' own motions are guesses."""
     intervals = max(100, round(PER_CYCLE * _cycles(mechanism, longest)))

@@ -322,10 +322,7 @@ def shifted(
 
 
 def _symmetric(
-    name: str,
-    mass: sp.Matrix,
-    coordinates: Sequence[Coordinate],
-    values: Mapping[sp.Symbol, float],
+    name: str, mass: sp.Matrix, coordinates: Sequence[Coordinate], values: Mapping[sp.Symbol, float]
 ) -> sp.Matrix:
     """Return the upper half mirrored, after a numeric look at M − Mᵀ where it is not plain."""
     n = len(coordinates)

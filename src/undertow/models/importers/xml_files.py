@@ -78,10 +78,7 @@ def parse_xml(source: str | Path, root: str, *more: str) -> ET.Element:
             ) from error
     if "<!ENTITY" in text:
         raise InvalidInputError(
-            what,
-            value="entity declarations",
-            limit="plain XML",
-            remedy="Expand the entities first",
+            what, value="entity declarations", limit="plain XML", remedy="Expand the entities first"
         )
     text = _DEFAULTED.sub(r"\1", _DECLARATION.sub("", text)).rstrip("\0 \t\r\n")
     try:

@@ -92,11 +92,7 @@ def largest(
 
 
 def nonsingular(
-    mechanism: Mechanism,
-    surface: Surface,
-    region: Box,
-    *,
-    max_boxes: int = MOST_BOXES,
+    mechanism: Mechanism, surface: Surface, region: Box, *, max_boxes: int = MOST_BOXES
 ) -> Verdict:
     """Decide whether the law exists all over a region, the general form of (37).
 
@@ -133,11 +129,7 @@ def nonsingular(
 
 
 def singular_distance(
-    mechanism: Mechanism,
-    surface: Surface,
-    region: Box,
-    *,
-    tolerance: float = 1e-6,
+    mechanism: Mechanism, surface: Surface, region: Box, *, tolerance: float = 1e-6
 ) -> tuple[float, float]:
     """Return by what factor a region may grow: proved non-singular, and refuted.
 

@@ -17,13 +17,7 @@ from numpy.typing import ArrayLike
 
 from undertow.base.arguments import require
 from undertow.base.verdict import Verdict, inward
-from undertow.law import (
-    LawLayout,
-    ProvedSet,
-    ReachingLaw,
-    Surface,
-    check_surface_shape,
-)
+from undertow.law import LawLayout, ProvedSet, ReachingLaw, Surface, check_surface_shape
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.claim import Claim
 from undertow.proofs.claims.model_data import law_of, model_of

@@ -120,11 +120,7 @@ def search_region(
 
 
 def prove_region(
-    motion: SurfaceMotion,
-    direction: ArrayLike,
-    *,
-    seconds: float = math.inf,
-    seed: int = 0,
+    motion: SurfaceMotion, direction: ArrayLike, *, seconds: float = math.inf, seed: int = 0
 ) -> ProvedRegion:
     """Search for a region of attraction, prove it, and raise its level as far as that goes.
 

@@ -17,11 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from undertow.base.errors import ModelError
 from undertow.law import ProvedSet, ReachingLaw, Surface
 from undertow.models.mechanism import FloatArray, Mechanism
-from undertow.proofs.claims.terminal_ellipsoid import (
-    ClosedLoopProgram,
-    TerminalEllipsoid,
-    prove,
-)
+from undertow.proofs.claims.terminal_ellipsoid import ClosedLoopProgram, TerminalEllipsoid, prove
 from undertow.proofs.kernel.compiled import between
 
 #: Smallest semi-axes, relative to the largest, that are tried first.

@@ -131,10 +131,7 @@ class Verification:
 
 @checked
 def verify(
-    certificate: Certificate | str | Path,
-    mechanism: Mechanism,
-    *,
-    progress: Progress | None = None,
+    certificate: Certificate | str | Path, mechanism: Mechanism, *, progress: Progress | None = None
 ) -> Verification:
     """Decide every claim of a certificate again, for a mechanism with its own parameters.
 

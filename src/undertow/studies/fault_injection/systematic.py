@@ -30,14 +30,7 @@ from types import FrameType
 
 import numpy as np
 
-from undertow.base import (
-    Progress,
-    UndertowError,
-    each,
-    error_text,
-    no_progress,
-    require,
-)
+from undertow.base import Progress, UndertowError, each, error_text, no_progress, require
 from undertow.cascade import CascadeState
 from undertow.models import FloatArray
 from undertow.plants import Measurement, Rig, RigWrapper
