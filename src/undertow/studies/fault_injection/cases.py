@@ -173,30 +173,14 @@ class OutputMonitor(RigWrapper):
 class Case:
     """One fault of the drill.
 
-    Parameters
-    ----------
-    part
-        What fails.
-    name
-        How.
-    holds
-        Whether the mechanism can still be held; otherwise the run must stop safely.
-    optimiser, answers, sensor, actuator, hang, estimator
-        What happens, at which seam.
-    silent
-        The optimiser answers no more.
-    push
-        Impulse on the last coordinate, N m s or N s.
-    slow
-        How long each read takes from then on, s.
-    operator, disk_full
-        The operator stops the run; the disk takes no more of the log.
-    since
-        When the fault begins, s, if not with the others.
-    ends
-        How the run may end; by default balanced or caught where it holds, else stopped or lost.
-    off
-        Whether the device can take an output of zero at the end.
+    ``part``: what fails. ``name``: how. ``holds``: whether the mechanism can still be held;
+    otherwise the run must stop safely. ``optimiser``, ``answers``, ``sensor``, ``actuator``,
+    ``hang``, ``estimator``: what happens, at which seam. ``silent``: the optimiser answers no more.
+    ``push``: impulse on the last coordinate, N m s or N s. ``slow``: how long each read takes from
+    then on, s. ``operator``, ``disk_full``: the operator stops the run; the disk takes no more of
+    the log. ``since``: when the fault begins, s, if not with the others. ``ends``: how the run may
+    end; by default balanced or caught where it holds, else stopped or lost. ``off``: whether the
+    device can take an output of zero at the end.
     """
 
     part: str

@@ -63,10 +63,7 @@ class Fault:
     def parse(cls, text: str) -> Self:
         """Return the fault that is written as ``write:17:always:ideal``.
 
-        Raises
-        ------
-        InvalidInputError
-            When it is none.
+        Raises InvalidInputError when it is none.
         """
         parts = text.split(":")
         right = len(parts) == 4 and parts[0] in OPERATIONS and parts[1].isdecimal()
