@@ -23,10 +23,7 @@ def rest_state(mechanism: Mechanism) -> FloatArray:
     Angles are tried at 0 and π, slides at 0, for an equilibrium without a growing mode: a
     pendulum hangs.
 
-    Raises
-    ------
-    InfeasibleError
-        When there is none: a ball rolls off its beam.
+    Raises InfeasibleError when there is none: a ball rolls off its beam.
 
     Examples
     --------
@@ -96,12 +93,8 @@ def perform(
     ``guard``: how far each coordinate may go from where it is now, (n,); ``until``: stop once one
     has gone so far, (n,).
 
-    Raises
-    ------
-    GuardError
-        When one goes further: the inputs are zero then.
-    ArtefactError
-        When one is not measured any more: so they are then.
+    Raises GuardError when one goes further: the inputs are zero then; ArtefactError when one is not
+    measured any more: so they are then.
     """
     times: list[float] = []
     positions: list[FloatArray] = []

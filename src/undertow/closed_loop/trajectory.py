@@ -230,10 +230,7 @@ class Trajectory:
     def to_pandas(self) -> Any:
         """Return a ``pandas.DataFrame`` with the index t, s; ``.attrs["units"]`` has the units.
 
-        Raises
-        ------
-        MissingExtraError
-            Without pandas.
+        Raises MissingExtraError without pandas.
         """
         pandas = require_extra("pandas", "interop", "data frames need pandas")
         columns = self.columns
@@ -247,10 +244,7 @@ class Trajectory:
     def to_xarray(self) -> Any:
         """Return an ``xarray.Dataset`` over t; each variable has its unit in ``.attrs["units"]``.
 
-        Raises
-        ------
-        MissingExtraError
-            Without xarray.
+        Raises MissingExtraError without xarray.
         """
         xarray = require_extra("xarray", "interop", "labelled arrays need xarray")
         return xarray.Dataset(

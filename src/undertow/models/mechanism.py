@@ -295,10 +295,7 @@ class Mechanism:
     def with_parameters(self, /, **values: float) -> Self:
         """Return the mechanism with some parameter values replaced, SI units.
 
-        Raises
-        ------
-        InvalidInputError
-            For an unknown name or a value outside the parameter's bounds.
+        Raises InvalidInputError for an unknown name or a value outside the parameter's bounds.
         """
         if not values:
             return self
@@ -321,12 +318,8 @@ class Mechanism:
         Unlike :meth:`with_parameters` it checks nothing but the mass matrix: for estimates that
         change many times a second.
 
-        Raises
-        ------
-        InvalidInputError
-            For values of another shape, or outside the parameter's bounds.
-        ModelError
-            When the mass matrix is not positive definite with them.
+        Raises InvalidInputError for values of another shape, or outside the parameter's bounds;
+        ModelError when the mass matrix is not positive definite with them.
         """
         numbers = self._columns("parameter values", values, [p.name for p in self.parameters])
         copy = object.__new__(type(self))
@@ -568,10 +561,8 @@ class Mechanism:
     def usual_start(self) -> FloatArray:
         """The usual initial state, (2n,).
 
-        Raises
-        ------
-        InvalidInputError
-            Where the mechanism has none: a run from the target would show nothing.
+        Raises InvalidInputError where the mechanism has none: a run from the target would show
+        nothing.
         """
         if not self.start:
             angle = self.coordinates[-1]
@@ -588,10 +579,7 @@ class Mechanism:
     def state(self, /, **values: float) -> FloatArray:
         """Return the state with the named entries set and all others zero, SI units.
 
-        Raises
-        ------
-        InvalidInputError
-            For an unknown state name or a value that is not finite.
+        Raises InvalidInputError for an unknown state name or a value that is not finite.
         """
         x = np.zeros(2 * self.n)
         names, remedy = self.state_names, "Use a coordinate's name, or its velocity's"
@@ -609,11 +597,8 @@ class Mechanism:
         Names may also be a mapping in the place of the vector: one that is a keyword of the
         function at hand has no other way in.
 
-        Raises
-        ------
-        InvalidInputError
-            For both a vector and names, for several states, and with neither where the mechanism
-            has no usual start.
+        Raises InvalidInputError for both a vector and names, for several states, and with neither
+        where the mechanism has no usual start.
         """
         if x0 is None:
             return self.state(**names) if names else self.usual_start
@@ -640,10 +625,7 @@ class Mechanism:
     def check_plant(self, plant: Mechanism) -> None:
         """Refuse a plant for this belief whose coordinates or inputs are not the belief's own.
 
-        Raises
-        ------
-        InvalidInputError
-            With the names and units of both.
+        Raises InvalidInputError with the names and units of both.
         """
         has, wanted = (
             ", ".join(
@@ -666,10 +648,7 @@ class Mechanism:
 
         Where its columns have names, as pandas has them, they are found by name, in any order.
 
-        Raises
-        ------
-        InvalidInputError
-            With the offending entry.
+        Raises InvalidInputError with the offending entry.
         """
         state = self._columns("state", x, self.state_names, BY_NAME)
         if not np.isfinite(state).all():
@@ -747,10 +726,7 @@ class Mechanism:
     def M(self, q: ArrayLike) -> FloatArray:
         """Return the mass matrix at q: (…, n) to (…, n, n), kg m² and the like.
 
-        Raises
-        ------
-        InvalidInputError
-            For positions of another shape, a state (…, 2n) for instance.
+        Raises InvalidInputError for positions of another shape, a state (…, 2n) for instance.
         """
         q = self._columns("positions", q, [c.name for c in self.coordinates])
         x = np.concatenate([q, np.zeros_like(q)], axis=-1)
@@ -793,10 +769,8 @@ class Mechanism:
         u counts from the input that holds the target, ``undertow.modelling.holding_input``.
         The arrays are the caller's own.
 
-        Raises
-        ------
-        ModelError
-            When the target is no equilibrium under any input, or f has no derivative there.
+        Raises ModelError when the target is no equilibrium under any input, or f has no derivative
+        there.
         """
         from undertow.models.linearisation import linearise
 
@@ -805,10 +779,7 @@ class Mechanism:
     def energy(self, x: ArrayLike, t: float = 0.0) -> FloatArray:
         """Return T + V at the states x, (…,), J, at the time t, s.
 
-        Raises
-        ------
-        ModelError
-            When the mechanism was given without a potential.
+        Raises ModelError when the mechanism was given without a potential.
         """
         if self.potential is None:
             raise ModelError(

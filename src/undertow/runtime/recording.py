@@ -68,10 +68,8 @@ class Recording:
 def read_log(path: str | Path) -> Recording:
     """Read a log, of a run that ended or was killed, with its further parts.
 
-    Raises
-    ------
-    ArtefactError
-        When it is no log, of a later version, damaged, or was killed before its first line.
+    Raises ArtefactError when it is no log, of a later version, damaged, or was killed before its
+    first line.
     """
     path = Path(path)
     found = _read_part(path)
@@ -198,10 +196,7 @@ class GrowingLog:
     def over(self) -> bool:
         """Whether its run has closed it, or has written no step for :data:`SILENCE`.
 
-        Raises
-        ------
-        ArtefactError
-            When it is no file, or not any more.
+        Raises ArtefactError when it is no file, or not any more.
         """
         path = part_path(self.path, self._part)
         check_file(path, "log", remedy="Name a log of a run")

@@ -56,12 +56,8 @@ def nmpc(mechanism: Mechanism, objective: Objective, **settings: Any) -> MakeCon
 
     ``settings`` are those of :class:`undertow.studies.trials.steering.NMPC`.
 
-    Raises
-    ------
-    InvalidInputError
-        For an objective that does not rise with every input, such as least time.
-    MissingExtraError
-        Without CasADi.
+    Raises InvalidInputError for an objective that does not rise with every input, such as least
+    time; MissingExtraError without CasADi.
     """
     return predictive(mechanism, objective.on(mechanism), **settings)
 
@@ -100,10 +96,7 @@ class Comparison:
     def to_pandas(self) -> Any:
         """Return a ``pandas.DataFrame`` with a row for each run.
 
-        Raises
-        ------
-        MissingExtraError
-            Without pandas.
+        Raises MissingExtraError without pandas.
         """
         pandas = require_extra("pandas", "interop", "data frames need pandas")
         return pandas.DataFrame(self.rows)

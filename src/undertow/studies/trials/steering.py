@@ -8,7 +8,7 @@ cascade's answers come a period late.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -250,41 +250,21 @@ def _terminal(belief: Mechanism, stage: sp.Expr, name: str) -> FloatArray:
         raise uncontrollable(belief) from error
 
 
-@dataclass(frozen=True, eq=False)
-class LinearFeedback:
-    """u = u_0 + K x within the inputs' limits: u_0 and ``limits`` (m,), ``gains`` K (m, 2n)."""
-
-    rest: FloatArray
-    gains: FloatArray
-    limits: FloatArray
-
-    def __call__(self, t: float, x: FloatArray) -> FloatArray:
-        """Return the input at (t, x), (m,)."""
-        return np.clip(self.rest + self.gains @ x, -self.limits, self.limits)
-
-
-@dataclass(frozen=True, eq=False)
-class Made:
-    """A maker of controllers that gives the same one to each run, set back; with a name."""
-
-    label: str
-    controller: StateFeedback = field(repr=False)
-
-    @property
-    def __name__(self) -> str:
-        """Its name, as that of a function that makes controllers."""
-        return self.label
-
-    def __call__(self, start: FloatArray) -> StateFeedback:
-        """Return the controller of a run from ``start``."""
-        if isinstance(self.controller, NMPC):
-            self.controller.reset()
-        return self.controller
-
-
 def predictive(belief: Mechanism, objective: Objective, **settings: Any) -> MakeController:
     """Return the maker of an NMPC controller: the same one for each run, set back."""
-    return Made("NMPC", NMPC(belief, objective, **settings))
+    controller = NMPC(belief, objective, **settings)
+
+    def make(_start: FloatArray) -> StateFeedback:
+        controller.reset()
+        return controller
+
+    return _named("NMPC", make)
+
+
+def _named(name: str, make: MakeController) -> MakeController:
+    """Give a maker of controllers the name that tables show."""
+    make.__name__ = name
+    return make
 
 
 def clipped_regulator(belief: Mechanism, free: float = 10.0) -> MakeController:
@@ -302,9 +282,12 @@ def clipped_regulator(belief: Mechanism, free: float = 10.0) -> MakeController:
         P = scipy.linalg.solve_continuous_are(lin.A, lin.input, Q, R)
     except np.linalg.LinAlgError as error:
         raise uncontrollable(belief) from error
-    k = -np.linalg.solve(R, lin.input.T @ P)
+    k = np.asarray(-np.linalg.solve(R, lin.input.T @ P), np.float64)
     slowest = np.linalg.eigvals(lin.A + lin.input @ k).real.max()
     if not slowest < -UNCONTROLLABLE * np.linalg.norm(lin.A, 2):  # a mode that k does not reach
         raise uncontrollable(belief)
 
-    return Made("LQR, clipped", LinearFeedback(rest, np.asarray(k, np.float64), limit))
+    def feedback(_t: float, x: FloatArray) -> FloatArray:
+        return np.clip(rest + k @ x, -limit, limit)
+
+    return _named("LQR, clipped", lambda _start: feedback)
