@@ -123,12 +123,8 @@ class Build:
 
     The folder has its files, or they are written there; the compiler takes GCC's options.
 
-    Raises
-    ------
-    MissingExtraError
-        When there is no such compiler.
-    ArtefactError
-        When the C does not compile, with the compiler's first complaint.
+    Raises MissingExtraError when there is no such compiler; ArtefactError when the C does not
+    compile, with the compiler's first complaint.
     """
 
     def __init__(self, controller: EmbeddedController, folder: Path, compiler: str = "gcc") -> None:

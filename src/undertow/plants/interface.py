@@ -121,13 +121,7 @@ class Rig(Protocol):
 
 
 class RigWrapper:
-    """A rig before another one: what a subclass does not change is passed on.
-
-    Parameters
-    ----------
-    rig
-        The rig behind it.
-    """
+    """A rig before another one, ``rig``: what a subclass does not change is passed on."""
 
     def __init__(self, rig: Rig) -> None:
         self.rig, self.period = rig, rig.period
@@ -150,11 +144,6 @@ class Paced(RigWrapper):
 
     A simulated rig advances when it is written to, hardware by itself: here each
     :meth:`write` waits until the next reading is due.  After a late one the pace starts anew.
-
-    Parameters
-    ----------
-    rig
-        The driver.
 
     Examples
     --------

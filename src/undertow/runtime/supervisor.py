@@ -65,10 +65,7 @@ class SupervisedRig:
     ``controller_timeout``, s, without an output the supervisor takes over; once it has let go it
     writes what it did to the file ``record``, as JSON.
 
-    Raises
-    ------
-    UndertowError
-        When the rig cannot be made: what was raised in the supervisor.
+    Raises what was raised in the supervisor when the rig cannot be made, an UndertowError.
     """
 
     def __init__(

@@ -165,10 +165,7 @@ def singular_distance(
 class NonsingularClaim(Claim):
     """The law exists all over a region of positions.
 
-    Parameters
-    ----------
-    region
-        Coordinate name to (low, high), SI units; coordinates left out stay at the target.
+    ``region``: coordinate name to (low, high), SI units; coordinates left out stay at the target.
     """
 
     region: Box

@@ -34,14 +34,8 @@ from undertow.proofs.kernel.model import Law, Model, System
 class TerminalEllipsoid(Claim):
     """The ellipsoid {x : |W x| ≤ radius} of the full state x = (q, q̇) as a terminal set.
 
-    Parameters
-    ----------
-    W
-        (2n, 2n), invertible.
-    U
-        (2n, 2n), close to W⁻¹ up to a scaling: the witness of the proof.
-    radius
-        ρ > 0.
+    ``W``: (2n, 2n), invertible. ``U``: (2n, 2n), close to W⁻¹ up to a scaling: the witness of the
+    proof. ``radius``: ρ > 0.
     """
 
     W: FloatArray

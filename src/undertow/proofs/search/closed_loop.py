@@ -53,14 +53,8 @@ MORE_PIECES, LEAST_WIDER = 8, 1.02
 class ProvedLoop:
     """Starts from which the loop converges.
 
-    Parameters
-    ----------
-    claim
-        What was found.
-    verdict
-        Its verdict, by the kernel.
-    seconds
-        Process time of search and proof together.
+    ``claim``: what was found. ``verdict``: its verdict, by the kernel. ``seconds``: process time of
+    search and proof together.
     """
 
     claim: LoopClaim

@@ -29,14 +29,9 @@ _NEEDED: Any = object()
 class Definition:
     """A campaign as data.
 
-    Parameters
-    ----------
-    mechanism
-        Its name, as for :func:`undertow.mechanisms.named.named`; paths are whole.
-    text
-        Everything else that the file says, as JSON.
-    code
-        Controllers of one's own that are entered, ``FILE.py:NAME`` with whole paths.
+    ``mechanism``: its name, as for :func:`undertow.mechanisms.named.named`; paths are whole.
+    ``text``: everything else that the file says, as JSON. ``code``: controllers of one's own that
+    are entered, ``FILE.py:NAME`` with whole paths.
     """
 
     mechanism: str

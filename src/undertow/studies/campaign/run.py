@@ -165,12 +165,7 @@ class CampaignResult:
 class Campaign:
     """A definition and its store.
 
-    Parameters
-    ----------
-    definition
-        What is computed.
-    path
-        Folder of the store.
+    ``definition``: what is computed. ``path``: folder of the store.
     """
 
     def __init__(self, definition: Definition, path: Path) -> None:

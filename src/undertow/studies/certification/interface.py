@@ -99,12 +99,7 @@ def certify(
 class Verification:
     """The claims of a certificate, each decided again; true if all of them hold.
 
-    Attributes
-    ----------
-    name
-        The mechanism's.
-    checked
-        In the order of the file.
+    ``name``: the mechanism's. ``checked``: in the order of the file.
     """
 
     name: str

@@ -163,8 +163,7 @@ class OutputMonitor(RigWrapper):
                 self.faults.append(f"past its limits: {u.tolist()}")
             elif (np.abs(u - self.last) > self.slew * (1.0 + 1e-9)).any():
                 self.faults.append(f"faster than its slew: {self.last.tolist()} to {u.tolist()}")
-        part = np.abs(u) / np.where(np.isfinite(self.limits), self.limits, math.inf)
-        self.largest = max(self.largest, float(np.max(part)))
+        self.largest = max(self.largest, float(np.max(np.abs(u) / self.limits)))
         self.last = u.copy()
         self.rig.write(u)
 

@@ -228,7 +228,6 @@ def _shifted(belief: Mechanism, held: FloatArray) -> dict[sp.Symbol, sp.Expr]:
 
 def _terminal(belief: Mechanism, stage: sp.Expr, name: str) -> FloatArray:
     """Return the value function at the target of the cost's second-order part, (2n, 2n)."""
-    lin = linearise(belief)
     symbols = [*belief.x, *belief.u]
     require_smooth(f"stage cost of '{name}'", [stage], symbols)
     hessian = sp.hessian(stage, symbols).subs(dict.fromkeys(symbols, 0))
@@ -244,6 +243,12 @@ def _terminal(belief: Mechanism, stage: sp.Expr, name: str) -> FloatArray:
             remedy="Take one in which every input costs something, for instance "
             "undertow.objective_for(mechanism, 'bench-time')",
         )
+    return _value(belief, Q, R)
+
+
+def _value(belief: Mechanism, Q: FloatArray, R: FloatArray) -> FloatArray:
+    """Return P of the least ∫ (xᵀQx + uᵀRu) dt = x₀ᵀPx₀ near the target, (2n, 2n)."""
+    lin = linearise(belief)
     try:
         return np.asarray(scipy.linalg.solve_continuous_are(lin.A, lin.input, Q, R), np.float64)
     except np.linalg.LinAlgError as error:
@@ -278,10 +283,7 @@ def clipped_regulator(belief: Mechanism, free: float = 10.0) -> MakeController:
     limit = belief.input_limits
     Q = np.diag([1.0] * m + [free] * (n - m) + [0.1] * n)
     R = np.diag(1.0 / finite_limits(belief) ** 2)
-    try:
-        P = scipy.linalg.solve_continuous_are(lin.A, lin.input, Q, R)
-    except np.linalg.LinAlgError as error:
-        raise uncontrollable(belief) from error
+    P = _value(belief, Q, R)
     k = np.asarray(-np.linalg.solve(R, lin.input.T @ P), np.float64)
     slowest = np.linalg.eigvals(lin.A + lin.input @ k).real.max()
     if not slowest < -UNCONTROLLABLE * np.linalg.norm(lin.A, 2):  # a mode that k does not reach
