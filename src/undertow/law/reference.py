@@ -58,6 +58,7 @@ from undertow.models import (
     normal_name,
     number_of,
 )
+from undertow.symbolic import numba
 
 #: Damping of swinging modes in the reference of the unactuated coordinates, of critical.
 SWING_DAMPING = 0.5
@@ -113,22 +114,12 @@ class ReferenceMotion:
         return len(self.t) > 1
 
     def rows(self, t: ArrayLike) -> FloatArray:
-        """Return q_r, q̇_r and q̈_r at the times t, (N,) to (N, 3n).
-
-        q_r and q̇_r are cubic between rows, q̈_r is linear.
-        """
-        t = np.atleast_1d(np.asarray(t, dtype=float))
-        if not self.moves:
-            return np.repeat(np.hstack([self.q, self.v, self.a]), len(t), axis=0)
-        k = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2)
-        h = (self.t[k + 1] - self.t[k])[:, None]
-        z = np.clip((t - self.t[k])[:, None] / h, 0.0, 1.0)
-        q = _hermite(z, h, self.q[k], self.q[k + 1], self.v[k], self.v[k + 1])
-        v = _hermite(z, h, self.v[k], self.v[k + 1], self.a[k], self.a[k + 1])
-        a = (1 - z) * self.a[k] + z * self.a[k + 1]
-        outside = (t < self.t[0]) | (t > self.t[-1])
-        v[outside] = a[outside] = 0.0
-        return np.hstack([q, v, a])
+        """Return q_r, q̇_r and q̈_r at the times t, (N,) to (N, 3n); see :func:`reference_row`."""
+        times = np.atleast_1d(np.asarray(t, dtype=float))
+        rows = np.empty((len(times), 3 * self.q.shape[1]))
+        for at, row in zip(times, rows, strict=True):
+            reference_row(at, self.t, self.q, self.v, self.a, row)
+        return rows
 
     def position(self, t: float) -> tuple[float, ...]:
         """Return q_r(t), n numbers."""
@@ -145,14 +136,39 @@ class ReferenceMotion:
         return error_dynamics(mechanism, self.rows(t)[0])
 
 
-def _hermite(
-    z: FloatArray, h: FloatArray, a: FloatArray, b: FloatArray, da: FloatArray, db: FloatArray
-) -> FloatArray:
-    """Return the cubic from a to b with these slopes, at the part z of the interval h."""
-    rest = 1 - z
-    return np.asarray(
-        rest**2 * ((1 + 2 * z) * a + h * z * da) + z**2 * ((3 - 2 * z) * b - h * rest * db)
-    )
+@numba.njit(cache=True, error_model="numpy")
+def reference_row(
+    t: float, times: FloatArray, q: FloatArray, v: FloatArray, a: FloatArray, row: FloatArray
+) -> None:
+    """Write q_r, q̇_r and q̈_r of a :class:`ReferenceMotion` at the time t into a row, (3n,).
+
+    q_r and q̇_r are cubic between its rows, q̈_r is linear; before and after them it rests.
+    """
+    n, last = q.shape[1], times.shape[0] - 1
+    row[n:] = 0.0
+    if last == 0:
+        for i in range(n):
+            row[i] = q[0, i]
+        return
+    low, high = 0, last - 1
+    while low < high:
+        middle = (low + high + 1) // 2
+        if times[middle] <= t:
+            low = middle
+        else:
+            high = middle - 1
+    h = times[low + 1] - times[low]
+    z = min(1.0, max(0.0, (t - times[low]) / h))
+    y = 1.0 - z
+    for i in range(n):
+        row[i] = y * y * ((1.0 + 2.0 * z) * q[low, i] + h * z * v[low, i]) + z * z * (
+            (3.0 - 2.0 * z) * q[low + 1, i] - h * y * v[low + 1, i]
+        )
+        if times[0] <= t <= times[last]:
+            row[n + i] = y * y * ((1.0 + 2.0 * z) * v[low, i] + h * z * a[low, i]) + z * z * (
+                (3.0 - 2.0 * z) * v[low + 1, i] - h * y * a[low + 1, i]
+            )
+            row[2 * n + i] = y * a[low, i] + z * a[low + 1, i]
 
 
 # -- set-points ------------------------------------------------------------------------------
