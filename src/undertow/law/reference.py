@@ -628,12 +628,10 @@ def _columns(path: Path, text: str) -> tuple[FloatArray, dict[str, FloatArray], 
     """Return times, the other columns of a file by name, SI units, and the units of those."""
     lines = csv.reader(io.StringIO(text))
     head = [cell.strip() for cell in next(lines, [])]
-    names: list[str] = []
-    factors: list[float] = []
-    units: list[str] = []
+    columns: list[tuple[str, float, str]] = []
     for cell in head:
         match = re.fullmatch(r"(\w+)\s*[(\[]\s*(\w+)\s*[)\]]", cell)
-        allowed = [u for u, (_, si) in FILE_UNITS.items() if (si == "s") == (not names)]
+        allowed = [u for u, (_, si) in FILE_UNITS.items() if (si == "s") == (not columns)]
         if match is None or match[2] not in allowed:
             raise InvalidInputError(
                 f"column '{cell}' of '{path}'",
@@ -641,10 +639,8 @@ def _columns(path: Path, text: str) -> tuple[FloatArray, dict[str, FloatArray], 
                 limit=f"a name with its unit, one of {', '.join(allowed)}",
                 remedy="Write the first line like: t (s), x (m), theta (deg)",
             )
-        factor, unit = FILE_UNITS[match[2]]
-        names.append(normal_name(match[1]))
-        factors.append(factor)
-        units.append(unit)
+        columns.append((normal_name(match[1]), *FILE_UNITS[match[2]]))
+    names = [name for name, _, _ in columns]
     if len(set(names)) < 2 or len(set(names)) < len(names):
         raise InvalidInputError(
             f"columns of '{path}'",
@@ -653,7 +649,7 @@ def _columns(path: Path, text: str) -> tuple[FloatArray, dict[str, FloatArray], 
         )
     rows = []
     for number, line in enumerate(lines, 2):
-        if not line or not "".join(line).strip():
+        if not "".join(line).strip():
             continue
         try:
             row = [float(cell) for cell in line]
@@ -666,9 +662,9 @@ def _columns(path: Path, text: str) -> tuple[FloatArray, dict[str, FloatArray], 
                 limit=f"{len(names)} finite numbers",
             )
         rows.append(row)
-    table = np.array(rows).reshape(-1, len(names)) * factors
-    columns = dict(zip(names[1:], table.T[1:], strict=True))
-    return table[:, 0], columns, dict(zip(names[1:], units[1:], strict=True))
+    table = np.array(rows).reshape(-1, len(names)) * [factor for _, factor, _ in columns]
+    units = {name: unit for name, _, unit in columns[1:]}
+    return table[:, 0], dict(zip(units, table.T[1:], strict=True)), units
 
 
 def _stable_inversion(

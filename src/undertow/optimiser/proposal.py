@@ -174,14 +174,8 @@ def motion_margins(
     except SingularSurfaceError as error:
         return (), str(error), error.remedy
     batch = loop.batch(x, plan, duration=horizon)
-    margins.append(
-        Margin(
-            "(37) along the motion: min det Γ(q)/det Γ(0)",
-            float(batch.singular[0]),
-            "",
-            "Start closer to the target",
-        )
-    )
+    what, least = "(37) along the motion: min det Γ(q)/det Γ(0)", float(batch.singular[0])
+    margins.append(Margin(what, least, "", "Start closer to the target"))
     if objective.hard_input:
         margins.append(
             Margin(
@@ -192,13 +186,9 @@ def motion_margins(
                 "actuator clip (hard_input=False)",
             )
         )
+    remedy = "Relax the constraint or start elsewhere"
     margins += [
-        Margin(
-            constraint.name,
-            float(value),
-            constraint.unit,
-            "Relax the constraint or start elsewhere",
-        )
+        Margin(constraint.name, float(value), constraint.unit, remedy)
         for constraint, value in zip(objective.constraints, batch.path[0], strict=True)
     ]
     event = Event(int(batch.event[0]))
