@@ -68,8 +68,11 @@ def miswired(rig: Rig, mechanism: Mechanism, faults: Sequence[str]) -> Rig:
     ``swap=theta,phi`` (the plugs of two encoders), ``delay=0.002`` (s, besides the rig's own, whole
     periods). Friction is the bench's: see :func:`rubbing`.
 
-    Raises InvalidInputError for a part that the mechanism does not have or that is named twice, for
-    what is no number, and for a delay that is not so many periods of the rig.
+    Raises
+    ------
+    InvalidInputError
+        For a part that the mechanism does not have or that is named twice, for what is no number,
+        and for a delay that is not so many periods of the rig.
     """
     factors, order = _read(mechanism, faults)
     late = factors["delay"] / rig.period
@@ -94,7 +97,10 @@ def miswired(rig: Rig, mechanism: Mechanism, faults: Sequence[str]) -> Rig:
 def rubbing(bench: Bench, faults: Sequence[str]) -> Bench:
     """Return a bench with as many times the dry friction as faults say: ``friction=10``.
 
-    Raises InvalidInputError as :func:`miswired` does.
+    Raises
+    ------
+    InvalidInputError
+        See :func:`miswired`.
     """
     factors, _ = _read(bench.mechanism, faults)
     return bench.with_friction(factors["friction"])

@@ -23,7 +23,10 @@ def rest_state(mechanism: Mechanism) -> FloatArray:
     Angles are tried at 0 and π, slides at 0, for an equilibrium without a growing mode: a
     pendulum hangs.
 
-    Raises InfeasibleError when there is none: a ball rolls off its beam.
+    Raises
+    ------
+    InfeasibleError
+        When there is none: a ball rolls off its beam.
 
     Examples
     --------
@@ -93,8 +96,12 @@ def perform(
     ``guard``: how far each coordinate may go from where it is now, (n,); ``until``: stop once one
     has gone so far, (n,).
 
-    Raises GuardError when one goes further: the inputs are zero then; ArtefactError when one is not
-    measured any more: so they are then.
+    Raises
+    ------
+    GuardError
+        When one goes further: the inputs are zero then.
+    ArtefactError
+        When one is not measured any more: so they are then.
     """
     times: list[float] = []
     positions: list[FloatArray] = []

@@ -110,10 +110,15 @@ def bring_up(
     compared. ``learn``: also a longer motion, from which delay, friction and parameters are
     identified.
 
-    Raises InfeasibleError when the model has no rest to start from; InvalidInputError for a delay
-    that is negative or no number, and for readings of another number than the coordinates;
-    ArtefactError when a driver fails, or a coordinate is lost during a motion: the inputs are zero
-    then.
+    Raises
+    ------
+    InfeasibleError
+        When the model has no rest to start from.
+    InvalidInputError
+        For a delay that is negative or no number, and for readings of another number than the
+        coordinates.
+    ArtefactError
+        When a driver fails, or a coordinate is lost during a motion: the inputs are zero then.
     """
     if delay is not None:
         positive("delay of the loop as it should be, s", delay, "0.002 is 2 ms", zero=True)

@@ -230,7 +230,10 @@ class Trajectory:
     def to_pandas(self) -> Any:
         """Return a ``pandas.DataFrame`` with the index t, s; ``.attrs["units"]`` has the units.
 
-        Raises MissingExtraError without pandas.
+        Raises
+        ------
+        MissingExtraError
+            Without pandas.
         """
         pandas = require_extra("pandas", "interop", "data frames need pandas")
         columns = self.columns
@@ -244,7 +247,10 @@ class Trajectory:
     def to_xarray(self) -> Any:
         """Return an ``xarray.Dataset`` over t; each variable has its unit in ``.attrs["units"]``.
 
-        Raises MissingExtraError without xarray.
+        Raises
+        ------
+        MissingExtraError
+            Without xarray.
         """
         xarray = require_extra("xarray", "interop", "labelled arrays need xarray")
         return xarray.Dataset(

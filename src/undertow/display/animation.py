@@ -43,7 +43,10 @@ _KINDS: dict[str, dict[str, Any]] = {
 def check_film(*, longest: float, speed: float, fps: float = 25.0) -> None:
     """Refuse a frame rate, a length, s, or a speed that no film has, before any long work.
 
-    Raises InvalidInputError for one that is not positive.
+    Raises
+    ------
+    InvalidInputError
+        For one that is not positive.
     """
     for name, value in (("frame rate", fps), ("length", longest), ("speed", speed)):
         positive(f"{name} of an animation", value)

@@ -39,8 +39,10 @@ def surface_trace(
     The motion has one input; each of the surfaces, (S,), takes over at its time, s, the first at
     the start; ``line`` has properties of the trace.
 
-    Raises InvalidInputError when there are several surfaces at once, m > 1: then s = 0 fixes no
-    single velocity.
+    Raises
+    ------
+    InvalidInputError
+        When there are several surfaces at once, m > 1: then s = 0 fixes no single velocity.
     """
     mechanism, m = trajectory.mechanism, trajectory.mechanism.m
     require(m == 1, f"surface trace of '{mechanism.name}'", f"m = {m}", "m = 1")

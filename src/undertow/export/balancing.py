@@ -162,7 +162,10 @@ class BalancingTask:
     def inputs(self, actions: NDArray[Any], *count: int) -> FloatArray:
         """Return the inputs of actions in [−1, 1], (m,), or (N, m) of ``count`` N, in their units.
 
-        Raises InvalidInputError for actions of another shape, and those that are no finite numbers.
+        Raises
+        ------
+        InvalidInputError
+            For actions of another shape, and those that are no finite numbers.
         """
         shape, remedy = (*count, self.mechanism.m), "Give a number in [−1, 1] for each input"
         what = "actions of a vector environment" if count else "action of an environment"

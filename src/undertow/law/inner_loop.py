@@ -73,8 +73,12 @@ class InnerLoop:
     def use(self, surface: Surface, reaching: ReachingLaw | None = None) -> None:
         """Exchange the surface, and the reaching law where one is given; checked first.
 
-        Raises InvalidInputError when shapes do not fit; SingularSurfaceError when Γ is singular at
-        the target.
+        Raises
+        ------
+        InvalidInputError
+            When shapes do not fit.
+        SingularSurfaceError
+            When Γ is singular at the target.
         """
         law = SlidingModeLaw(self.mechanism, surface, reaching or self.reaching)
         self.lane = pack_law_parameters(law)
@@ -144,7 +148,10 @@ def matrix_at_target(
 ) -> FloatArray:
     """Return A of the closed loop ẋ = Ax near the target, (2n, 2n); the paper's gains by default.
 
-    Raises ModelError as for :func:`undertow.models.linearise`.
+    Raises
+    ------
+    ModelError
+        As for :func:`undertow.models.linearise`.
     """
     plant = linearise(mechanism)
     return plant.A + plant.input @ feedback_at_target(mechanism, surface, reaching)

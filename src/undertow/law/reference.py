@@ -243,8 +243,11 @@ class SetPoints:
     ) -> tuple[tuple[float, ReferenceMotion], ...]:
         """Return when each set-point begins, s, the first at 0, and where it is.
 
-        Raises InvalidInputError for a name that the mechanism has not, a velocity that is not zero,
-        and a position where it does not rest.
+        Raises
+        ------
+        InvalidInputError
+            For a name that the mechanism has not, a velocity that is not zero, and a position where
+            it does not rest.
         """
         del seconds  # a rest lasts
         q, found = np.zeros(mechanism.n), []
@@ -544,10 +547,12 @@ class Reference:
     ) -> tuple[tuple[float, ReferenceMotion], ...]:
         """Return 0 and the motion x_r that is asked for from 0 to ``seconds``.
 
-        Raises InvalidInputError for a coordinate that is not actuated, that is measured in another
-        unit, or that the equations depend on; for values that are no finite numbers; for a length
-        or a period whose grid is too large; and where the unactuated coordinates have no bounded
-        motion.
+        Raises
+        ------
+        InvalidInputError
+            For a coordinate that is not actuated, that is measured in another unit, or that the
+            equations depend on; for values that are no finite numbers; for a length or a period
+            whose grid is too large; and where the unactuated coordinates have no bounded motion.
         """
         positive("length of a reference, s", seconds, "Give duration=")
         window = self.period if self.period else seconds + 2 * REST

@@ -178,9 +178,13 @@ def _paper_margins(mechanism: Mechanism, surface: Surface) -> tuple[Margin, ...]
 def check_surface(mechanism: Mechanism, surface: Surface, x0: ArrayLike | None = None) -> None:
     """Refuse a surface that is unstable, or singular at the target or at ``x0``.
 
-    Raises UnstableSurfaceError when the exact stability condition fails; the message names which of
-    (35)-(36) is to blame where the mechanism is of the paper's kind; SingularSurfaceError when
-    (37) fails at the target or at the initial state.
+    Raises
+    ------
+    UnstableSurfaceError
+        The exact stability condition fails; the message names which of (35)-(36) is to
+        blame where the mechanism is of the paper's kind.
+    SingularSurfaceError
+        (37) fails at the target or at the initial state.
     """
     margins = surface_margins(mechanism, surface)
     target = float(singularity(mechanism, surface.vector, np.zeros(mechanism.n)))
@@ -266,7 +270,10 @@ def quadratic_designs(mechanism: Mechanism, weights: ArrayLike) -> tuple[Surface
 
     They are kept on disk together.
 
-    Raises InvalidInputError for weights of another shape, or that are not positive.
+    Raises
+    ------
+    InvalidInputError
+        For weights of another shape, or that are not positive.
     """
     rows = floats("weights of quadratic designs", weights)
     good = rows.ndim == 2 and rows.shape[1] == 2 * mechanism.n
@@ -337,8 +344,12 @@ def _designing(mechanism: Mechanism, what: str, given: Sequence[object]) -> Iter
 def placed_surface(mechanism: Mechanism, poles: Sequence[complex]) -> Surface:
     """Design a surface whose sliding dynamics have the given 2n − m eigenvalues, 1/s.
 
-    Raises InvalidInputError for a wrong number of poles or poles that are not left of the imaginary
-    axis; ModelError when (A, B) is not controllable.
+    Raises
+    ------
+    InvalidInputError
+        For a wrong number of poles or poles that are not left of the imaginary axis.
+    ModelError
+        When (A, B) is not controllable.
     """
     n, m = mechanism.n, mechanism.m
     free = 2 * n - m

@@ -263,7 +263,10 @@ class Surface:
 
         w = q_a + λ_a⁻¹ λ_u q_u is the slow coordinate: on the surface ẇ follows from q̇_u and w.
 
-        Raises InvalidInputError for another shape, and where λ_a is singular.
+        Raises
+        ------
+        InvalidInputError
+            For another shape, and where λ_a is singular.
         """
         states, n, m = _rows("states of a surface", x, 2 * self.n), self.n, self.m
         w = states[..., :m] + states[..., m:n] @ self._lean.T
@@ -370,8 +373,10 @@ class ReachingLaw:
     def check_period(self, name: str, period: float, m: int) -> None:
         """Refuse a time between two inputs, s, in which s would cross its layer.
 
-        Raises InvalidInputError unless it is below 2 ε/η; of ``"sign"``, which has no layer, any
-        will do.
+        Raises
+        ------
+        InvalidInputError
+            Unless it is below 2 ε/η; of ``"sign"``, which has no layer, any will do.
         """
         eta, layer = self.per_surface(m)
         longest = float(np.min(2 * layer / eta))

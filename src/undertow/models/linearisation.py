@@ -72,7 +72,10 @@ class Linearisation:
     def ss(self) -> Any:
         """Return ẋ = A x + B u, y = x as a ``control.StateSpace`` of python-control, with names.
 
-        Raises MissingExtraError without python-control.
+        Raises
+        ------
+        MissingExtraError
+            Without python-control.
         """
         control = require_extra("control", "interop", "state-space objects need python-control")
         size, m = len(self.states), len(self.inputs)
@@ -92,8 +95,10 @@ class Linearisation:
 def linearise(mechanism: Mechanism) -> Linearisation:
     """Linearise a mechanism at its target x = 0, disturbances at t = 0 included.
 
-    Raises ModelError when the target is no equilibrium under any input, or f has no derivative
-    there.
+    Raises
+    ------
+    ModelError
+        When the target is no equilibrium under any input, or f has no derivative there.
     """
     n = mechanism.n
     if not _is_analytic(mechanism.force, mechanism.x):

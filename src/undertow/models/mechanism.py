@@ -295,7 +295,10 @@ class Mechanism:
     def with_parameters(self, /, **values: float) -> Self:
         """Return the mechanism with some parameter values replaced, SI units.
 
-        Raises InvalidInputError for an unknown name or a value outside the parameter's bounds.
+        Raises
+        ------
+        InvalidInputError
+            For an unknown name or a value outside the parameter's bounds.
         """
         if not values:
             return self
@@ -318,8 +321,12 @@ class Mechanism:
         Unlike :meth:`with_parameters` it checks nothing but the mass matrix: for estimates that
         change many times a second.
 
-        Raises InvalidInputError for values of another shape, or outside the parameter's bounds;
-        ModelError when the mass matrix is not positive definite with them.
+        Raises
+        ------
+        InvalidInputError
+            For values of another shape, or outside the parameter's bounds.
+        ModelError
+            When the mass matrix is not positive definite with them.
         """
         numbers = self._columns("parameter values", values, [p.name for p in self.parameters])
         copy = object.__new__(type(self))
@@ -561,8 +568,10 @@ class Mechanism:
     def usual_start(self) -> FloatArray:
         """The usual initial state, (2n,).
 
-        Raises InvalidInputError where the mechanism has none: a run from the target would show
-        nothing.
+        Raises
+        ------
+        InvalidInputError
+            Where the mechanism has none: a run from the target would show nothing.
         """
         if not self.start:
             angle = self.coordinates[-1]
@@ -579,7 +588,10 @@ class Mechanism:
     def state(self, /, **values: float) -> FloatArray:
         """Return the state with the named entries set and all others zero, SI units.
 
-        Raises InvalidInputError for an unknown state name or a value that is not finite.
+        Raises
+        ------
+        InvalidInputError
+            For an unknown state name or a value that is not finite.
         """
         x = np.zeros(2 * self.n)
         names, remedy = self.state_names, "Use a coordinate's name, or its velocity's"
@@ -597,8 +609,11 @@ class Mechanism:
         Names may also be a mapping in the place of the vector: one that is a keyword of the
         function at hand has no other way in.
 
-        Raises InvalidInputError for both a vector and names, for several states, and with neither
-        where the mechanism has no usual start.
+        Raises
+        ------
+        InvalidInputError
+            For both a vector and names, for several states, and with neither where the mechanism
+            has no usual start.
         """
         if x0 is None:
             return self.state(**names) if names else self.usual_start
@@ -625,7 +640,10 @@ class Mechanism:
     def check_plant(self, plant: Mechanism) -> None:
         """Refuse a plant for this belief whose coordinates or inputs are not the belief's own.
 
-        Raises InvalidInputError with the names and units of both.
+        Raises
+        ------
+        InvalidInputError
+            With the names and units of both.
         """
         has, wanted = (
             ", ".join(
@@ -648,7 +666,10 @@ class Mechanism:
 
         Where its columns have names, as pandas has them, they are found by name, in any order.
 
-        Raises InvalidInputError with the offending entry.
+        Raises
+        ------
+        InvalidInputError
+            With the offending entry.
         """
         state = self._columns("state", x, self.state_names, BY_NAME)
         if not np.isfinite(state).all():
@@ -726,7 +747,10 @@ class Mechanism:
     def M(self, q: ArrayLike) -> FloatArray:
         """Return the mass matrix at q: (…, n) to (…, n, n), kg m² and the like.
 
-        Raises InvalidInputError for positions of another shape, a state (…, 2n) for instance.
+        Raises
+        ------
+        InvalidInputError
+            For positions of another shape, a state (…, 2n) for instance.
         """
         q = self._columns("positions", q, [c.name for c in self.coordinates])
         x = np.concatenate([q, np.zeros_like(q)], axis=-1)
@@ -769,8 +793,10 @@ class Mechanism:
         u counts from the input that holds the target, ``undertow.modelling.holding_input``.
         The arrays are the caller's own.
 
-        Raises ModelError when the target is no equilibrium under any input, or f has no derivative
-        there.
+        Raises
+        ------
+        ModelError
+            When the target is no equilibrium under any input, or f has no derivative there.
         """
         from undertow.models.linearisation import linearise
 
@@ -779,7 +805,10 @@ class Mechanism:
     def energy(self, x: ArrayLike, t: float = 0.0) -> FloatArray:
         """Return T + V at the states x, (…,), J, at the time t, s.
 
-        Raises ModelError when the mechanism was given without a potential.
+        Raises
+        ------
+        ModelError
+            When the mechanism was given without a potential.
         """
         if self.potential is None:
             raise ModelError(

@@ -96,7 +96,10 @@ def normal_unit(unit: str) -> str:
 def number_of(what: str, value: object, *, limit: str = "a number", remedy: str = "") -> float:
     """Return a real number as a float; refuse everything else: text, None, arrays, booleans.
 
-    Raises InvalidInputError with what was given instead.
+    Raises
+    ------
+    InvalidInputError
+        With what was given instead.
     """
     if isinstance(value, sp.Expr) and value.is_number and value.is_real:
         return float(value)
@@ -116,7 +119,10 @@ def number_of(what: str, value: object, *, limit: str = "a number", remedy: str 
 def deg(angle: float) -> float:
     """Return an angle in degrees in radians.
 
-    Raises InvalidInputError for what is no number: text, None, an array.
+    Raises
+    ------
+    InvalidInputError
+        For what is no number: text, None, an array.
 
     Examples
     --------

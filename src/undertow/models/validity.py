@@ -106,8 +106,10 @@ def repeated_names(names: Sequence[str]) -> str:
 def by_names(what: str, values: Mapping[str, T]) -> dict[str, T]:
     """Return values by their names in Python's spelling, NFKC.
 
-    Raises InvalidInputError for two names that are the same to Python, and for keys that are not
-    text.
+    Raises
+    ------
+    InvalidInputError
+        For two names that are the same to Python, and for keys that are not text.
 
     Examples
     --------
@@ -177,7 +179,10 @@ def vocabulary(
 def expression_of(what: str, value: object) -> sp.Expr:
     """Return a number or an expression as SymPy's; refuse text, which SymPy would evaluate.
 
-    Raises ModelError for anything that is not an expression.
+    Raises
+    ------
+    ModelError
+        For anything that is not an expression.
     """
     try:
         expression = sp.sympify(value, strict=True)
@@ -206,7 +211,10 @@ def check_symbols(
     ``what`` says whose expressions these are, for the message; ``known`` is what they may hold, see
     :func:`vocabulary`.
 
-    Raises ModelError with the unknown symbols, and what was probably meant.
+    Raises
+    ------
+    ModelError
+        With the unknown symbols, and what was probably meant.
     """
     unknown: set[sp.Basic] = set()
     for expression in expressions:
@@ -331,7 +339,10 @@ def require_smooth(
     ``orders`` derivatives are taken one after the other: x |x| has one, and no second. ``what`` is
     for the message.
 
-    Raises ModelError with the first expression that is not smooth.
+    Raises
+    ------
+    ModelError
+        With the first expression that is not smooth.
     """
     found = next(kinks(expressions, variables, at=at, orders=orders), None)
     if found is not None:

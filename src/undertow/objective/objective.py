@@ -301,7 +301,10 @@ def travel_box(mechanism: Mechanism, but: Container[str] = ()) -> tuple[Constrai
 def check_travel(mechanism: Mechanism, name: str, low: float, high: float, shown: str) -> None:
     """Refuse a box, ``shown`` in words, that reaches beyond the travel of its coordinate.
 
-    Raises InvalidInputError with the travel that the mechanism declares.
+    Raises
+    ------
+    InvalidInputError
+        With the travel that the mechanism declares.
     """
     for c in mechanism.coordinates:
         if c.name == name and (low < c.low or high > c.high):
@@ -593,7 +596,10 @@ class Objective:
     def stage_function(self, mechanism: Mechanism) -> Callable[..., Any]:
         """Return [Φ] as a function of the states and inputs, one by one, for a mechanism's numbers.
 
-        Raises InvalidInputError as for :meth:`stage_cost`.
+        Raises
+        ------
+        InvalidInputError
+            As for :meth:`stage_cost`.
         """
         stage = self.stage_cost(mechanism).subs(mechanism.substitution)
         return compile_expressions([*mechanism.x, *mechanism.u], [stage])
@@ -602,8 +608,11 @@ class Objective:
     def stage_cost(self, mechanism: Mechanism) -> sp.Expr:
         """Return Φ(x, u) as an expression.
 
-        Raises InvalidInputError for unknown names, for Φ = 0, and where Φ is negative or no number
-        at the target or at one of 255 random states and inputs.
+        Raises
+        ------
+        InvalidInputError
+            For unknown names, for Φ = 0, and where Φ is negative or no number at the target or at
+            one of 255 random states and inputs.
         """
         what = f"stage cost of '{self.name}'"
         stage = self._expression(mechanism, what, self.stage)

@@ -342,9 +342,13 @@ class Optimiser:
     def require(self, x: ArrayLike) -> Proposal:
         """Return a global optimum from x, or raise with the evidence.
 
-        Raises InvalidInputError for a start that breaks a path constraint itself; InfeasibleError
-        when no candidate was admissible, with what the best of them broke; before any search where
-        the inputs cannot hold the target.
+        Raises
+        ------
+        InvalidInputError
+            For a start that breaks a path constraint itself.
+        InfeasibleError
+            When no candidate was admissible, with what the best of them broke; before any search
+            where the inputs cannot hold the target.
         """
         loop = self.loop
         loop.objective.check_start(loop.mechanism, loop.mechanism.check_state(x))

@@ -108,7 +108,10 @@ class Proposal:
     def required(self, loop: ClosedLoop, x: FloatArray) -> Proposal:
         """Return it as it is, or raise with the evidence where there is no plan from x, (2n,).
 
-        Raises InfeasibleError when no candidate was admissible; says what the best of them broke.
+        Raises
+        ------
+        InfeasibleError
+            When no candidate was admissible; says what the best of them broke.
         """
         if self.plan is None:
             check_held(loop)

@@ -115,7 +115,10 @@ class Rig(Protocol):
     def close(self) -> None:
         """Let go of the rig; inputs go to zero.
 
-        Raises OutputOnError when it is known that they did not.
+        Raises
+        ------
+        OutputOnError
+            When it is known that they did not.
         """
         ...
 
@@ -205,8 +208,12 @@ def rig_from_file(text: str, mechanism: Mechanism) -> Rig:
 
     It is called without arguments, and read once.
 
-    Raises ArtefactError when the file cannot be read or fails, or the rig cannot be read;
-    InvalidInputError when what is there has not what a rig has, see :class:`undertow.plants.Rig`.
+    Raises
+    ------
+    ArtefactError
+        When the file cannot be read or fails, or the rig cannot be read.
+    InvalidInputError
+        When what is there has not what a rig has, see :class:`undertow.plants.Rig`.
     """
     rig: Rig = object_from_file(text, "rig", lambda v: callable(v) or hasattr(v, "read"))
     try:
@@ -221,8 +228,13 @@ def rig_from_file(text: str, mechanism: Mechanism) -> Rig:
 def check_rig(rig: Rig, mechanism: Mechanism, name: str = "rig of one's own") -> None:
     """Refuse what is no rig of a mechanism, before it moves; it is read once.
 
-    Raises ArtefactError when it cannot be read; InvalidInputError when it has not what a rig has,
-    see :class:`undertow.plants.Rig`, or simulates another mechanism.
+    Raises
+    ------
+    ArtefactError
+        When it cannot be read.
+    InvalidInputError
+        When it has not what a rig has, see :class:`undertow.plants.Rig`; when it simulates another
+        mechanism.
     """
     lacking = [part for part in ("read", "write", "close") if not callable(getattr(rig, part, 0))]
     period = getattr(rig, "period", None)

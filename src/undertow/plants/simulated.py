@@ -184,8 +184,11 @@ class RealisticRig:
     def write(self, u: ArrayLike) -> None:
         """Apply the inputs u, (m,), and advance to the next sample.
 
-        Raises InvalidInputError for an input that is not a number, for which no amplifier has a
-        voltage, or of another shape.
+        Raises
+        ------
+        InvalidInputError
+            For an input that is not a number: no amplifier has a voltage for that; for another
+            shape.
         """
         try:
             self._u[:] = u

@@ -16,7 +16,6 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from undertow.base.arguments import require
 from undertow.base.errors import InvalidInputError
 from undertow.models.mechanism import TIME, Mechanism
 from undertow.models.validity import require_smooth
@@ -69,13 +68,6 @@ def exact_mechanism(mechanism: Mechanism) -> Mechanism:
         require_smooth(what, matrix, mechanism.x, at=target, orders=2)
     changed = {k: v for k, v in exact.items() if v != getattr(mechanism, k)}
     return replace(mechanism, **changed) if changed else mechanism
-
-
-def require_autonomous(mechanism: Mechanism, proved: str) -> None:
-    """Refuse a force that depends on time."""
-    remedy = f"Prove the {proved} for the undisturbed mechanism"
-    good = TIME not in mechanism.force.free_symbols
-    require(good, f"force of '{mechanism.name}'", "depends on time", "autonomous", remedy)
 
 
 def is_odd(

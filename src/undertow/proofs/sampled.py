@@ -47,7 +47,10 @@ def failure_bound(failures: int, trials: int, confidence: float = 0.999) -> floa
 def box_starts(mechanism: Mechanism, **ranges: tuple[float, float]) -> Sampler:
     """Return a uniform distribution of starts over named states, the others at the target.
 
-    Raises InvalidInputError for an unknown state or an empty range.
+    Raises
+    ------
+    InvalidInputError
+        For an unknown state or an empty range.
     """
     names = mechanism.state_names
     low, high = np.zeros(2 * mechanism.n), np.zeros(2 * mechanism.n)

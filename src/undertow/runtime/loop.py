@@ -209,8 +209,12 @@ class Runtime:
         did is in the report and in its verdict.  An interrupt that a driver lets through counts as
         the operator's stop; other ways out of the interpreter are taken after the safe stop.
 
-        Raises InvalidInputError when it has run already: its rig has been let go of; ResourceError
-        when the system has no thread or memory left for the run.
+        Raises
+        ------
+        InvalidInputError
+            When it has run already: its rig has been let go of.
+        ResourceError
+            When the system has no thread or memory left for the run.
         """
         if self.report.steps or self._released:
             raise InvalidInputError(

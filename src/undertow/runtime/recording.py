@@ -68,8 +68,10 @@ class Recording:
 def read_log(path: str | Path) -> Recording:
     """Read a log, of a run that ended or was killed, with its further parts.
 
-    Raises ArtefactError when it is no log, of a later version, damaged, or was killed before its
-    first line.
+    Raises
+    ------
+    ArtefactError
+        When it is no log, of a later version, damaged, or was killed before its first line.
     """
     path = Path(path)
     found = _read_part(path)
@@ -193,7 +195,10 @@ class GrowingLog:
     def over(self) -> bool:
         """Whether its run has closed it, or has written no step for :data:`SILENCE`.
 
-        Raises ArtefactError when it is no file, or not any more.
+        Raises
+        ------
+        ArtefactError
+            When it is no file, or not any more.
         """
         path = part_path(self.path, self._part)
         check_file(path, "log", remedy="Name a log of a run")

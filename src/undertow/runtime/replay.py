@@ -246,8 +246,10 @@ def replay_controller(
 ) -> Replay:
     """Replay a log through a controller built as for the run, idle.
 
-    Raises ArtefactError when the controller believes in another mechanism than the log, or the log
-    is damaged.
+    Raises
+    ------
+    ArtefactError
+        When the controller believes in another mechanism than the log, or the log is damaged.
     """
     _check_mechanism(recording, controller.cascade.mechanism)
     with legible(recording.path):

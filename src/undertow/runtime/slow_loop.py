@@ -124,7 +124,7 @@ def is_answer(said: object) -> TypeGuard[Answer]:
 def law_vectors_of(cascade: Cascade, memory: CascadeState) -> FloatArray:
     """Return the numbers of the compiled law for each surface of its plan, (S, 2mn + 2m + 1).
 
-    Raises UndertowError for a plan that does not fit the mechanism, or is singular at the
+    Raises UndertowError for for a plan that does not fit the mechanism, or is singular at the
     target.
     """
     plan, believed = memory.plan, cascade.believed(memory)

@@ -119,8 +119,14 @@ class SupervisedRig:
 
         After a while without outputs, as before a run, it takes a new one.
 
-        Raises TimeoutError when the supervisor does not answer within half a period, or 50 ms for a
-        new one; EOFError when it is gone; OSError when the rig could not be read.
+        Raises
+        ------
+        TimeoutError
+            When the supervisor does not answer within half a period, or 50 ms for a new one.
+        EOFError
+            When it is gone.
+        OSError
+            When the rig could not be read.
         """
         patience = 0.5 * self.period
         if not self._unanswered and time.perf_counter() - self._heard > ANSWER:
@@ -137,8 +143,12 @@ class SupervisedRig:
     def write(self, u: FloatArray) -> None:
         """Hand the output to the supervisor.
 
-        Raises OSError when the supervisor is gone, or the rig did not take the output before;
-        TimeoutError when so much is unanswered that to send more could block.
+        Raises
+        ------
+        OSError
+            When the supervisor is gone, or the rig did not take the output before.
+        TimeoutError
+            When so much is unanswered that to send more could block.
         """
         if self._said.write:
             self._listen()  # who only writes, as after a safe stop, is told what came of it
@@ -158,9 +168,12 @@ class SupervisedRig:
     def close(self) -> None:
         """Let the supervisor bring the output to zero and let go.
 
-        Raises OutputOnError when the rig did not take zero, or the supervisor does not say whether
-        it did; OSError when the rig took it, but could not be closed.  A supervisor whose rig hangs
-        is ended.
+        Raises
+        ------
+        OutputOnError
+            When the rig did not take zero, or the supervisor does not say whether it did.
+        OSError
+            When the rig took it, but could not be closed.  A supervisor whose rig hangs is ended.
         """
         if self._closed:
             return

@@ -285,7 +285,10 @@ def send_target(log: str | Path, target: Mapping[str, float] | SetPoints) -> Run
 def target_of_run(log: str | Path) -> RunTarget:
     """Return where a run that goes on is steered; see :func:`send_target`.
 
-    Raises ArtefactError when nobody listens there.
+    Raises
+    ------
+    ArtefactError
+        When nobody listens there.
     """
     return _asked(Path(log), {})
 

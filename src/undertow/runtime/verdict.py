@@ -129,7 +129,10 @@ class Report:
     def unless_interrupted(self) -> Self:
         """Return it; where a signal stopped the run, what the run is a part of ends, too.
 
-        Raises KeyboardInterrupt where a signal stopped it: a run that was stopped is no result.
+        Raises
+        ------
+        KeyboardInterrupt
+            Then: a run that was stopped is no result.
         """
         if self.interrupted:
             raise KeyboardInterrupt

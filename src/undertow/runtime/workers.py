@@ -254,7 +254,10 @@ def background_worker(
     that hangs or dies; 0: a thread of this process. ``shared`` is what requests and answers hold
     that both sides have: a long reference.
 
-    Raises ResourceError when the system has no process or thread more.
+    Raises
+    ------
+    ResourceError
+        When the system has no process or thread more.
     """
     forked = processes >= 1 and hasattr(os, "fork")
     computers: list[_Computer[Asked, Said]] = []

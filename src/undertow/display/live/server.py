@@ -67,7 +67,10 @@ class Show(Protocol):
     def hear(self, said: Message, viewer: int) -> None:
         """Do what a viewer asks for.
 
-        Raises InvalidInputError for what cannot be done: the viewer is told.
+        Raises
+        ------
+        InvalidInputError
+            For what cannot be done: the viewer is told.
         """
         ...
 
@@ -267,7 +270,10 @@ class Server:
 def check_port(port: int) -> None:
     """Refuse a port of 127.0.0.1 that is taken, before any long work.
 
-    Raises ArtefactError as for :func:`serve`.
+    Raises
+    ------
+    ArtefactError
+        As for :func:`serve`.
     """
     try:
         socket.create_server((HOST, port)).close()

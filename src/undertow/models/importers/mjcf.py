@@ -98,8 +98,10 @@ def from_mjcf(
 def read_mjcf(source: str | Path, *, motors: bool = True) -> Tree:
     """Read an MJCF file as a tree; ``motors=False`` leaves its actuators out.
 
-    Raises ArtefactError, InvalidInputError, MissingExtraError or ModelError as for
-    :func:`from_mjcf`.
+    Raises
+    ------
+    ArtefactError, InvalidInputError, MissingExtraError, ModelError
+        As for :func:`from_mjcf`.
     """
     return _read(mjcf_document(source), motors=motors)[0]
 

@@ -70,8 +70,12 @@ def compiled(mujoco: Any, document: Document) -> Any:
     The compiler refuses those that no body has, and files round theirs and have thin rods; what
     they are is for the tree to judge.
 
-    Raises InvalidInputError in MuJoCo's own words, where its compiler refuses; ModelError likewise,
-    where the mechanics is the reason: an inertia, or a part that does not exist.
+    Raises
+    ------
+    InvalidInputError
+        In MuJoCo's own words, where its compiler refuses.
+    ModelError
+        Likewise, where the mechanics is the reason: an inertia, or a part that does not exist.
     """
     try:
         with _quiet(mujoco):

@@ -35,8 +35,12 @@ def in_a_file(text: str) -> bool:
 def mechanism_from_file(text: str) -> Mechanism:
     """Load a user-defined mechanism: ``FILE.py:NAME``, a Mechanism or a function that makes one.
 
-    Raises ArtefactError when the file cannot be read or fails; InvalidInputError when there is no
-    mechanism under that name.
+    Raises
+    ------
+    ArtefactError
+        When the file cannot be read or fails.
+    InvalidInputError
+        When there is no mechanism under that name.
     """
     found = object_from_file(text, "mechanism", _makes_mechanism)
     if not isinstance(found, Mechanism):

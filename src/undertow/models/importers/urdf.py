@@ -144,7 +144,10 @@ def read_urdf(
 ) -> tuple[Tree, tuple[str, ...]]:
     """Read a URDF: the tree, and the joints that its transmissions name.
 
-    Raises ArtefactError, InvalidInputError or ModelError as for :func:`from_urdf`.
+    Raises
+    ------
+    ArtefactError, InvalidInputError, ModelError
+        As for :func:`from_urdf`.
     """
     return _read(parse_xml(source, "robot"), gravity)
 

@@ -90,7 +90,10 @@ class Certificate:
     ) -> Self:
         """State the proved claims of one mechanism's surfaces; only they go into the file.
 
-        Raises CertificateError for a claim that is not proved, or what a file cannot hold.
+        Raises
+        ------
+        CertificateError
+            For a claim that is not proved, or what a file cannot hold.
         """
         for verdict in (claim.verdict for subject in subjects for claim in subject.claims):
             if not verdict:
@@ -114,7 +117,10 @@ class Certificate:
     def from_bytes(cls, content: bytes) -> Self:
         """Read a file; what is damaged, edited, or of another version is refused.
 
-        Raises CertificateError with what is wrong.
+        Raises
+        ------
+        CertificateError
+            With what is wrong.
         """
         document = read_document(content)
         subjects = []
@@ -130,7 +136,10 @@ class Certificate:
     def document(self) -> Document:
         """What the kernel decides.
 
-        Raises CertificateError where no claim is proved.
+        Raises
+        ------
+        CertificateError
+            Where no claim is proved.
         """
         if self._document is None:
             raise CertificateError(
@@ -155,7 +164,10 @@ class Certificate:
     def to_bytes(self) -> bytes:
         """Return the file.
 
-        Raises CertificateError where no claim is proved.
+        Raises
+        ------
+        CertificateError
+            Where no claim is proved.
         """
         _ = self.document  # refused where there is none
         return self.content
@@ -163,7 +175,12 @@ class Certificate:
     def save(self, path: str | Path) -> Path:
         """Write the file that :func:`undertow.verify` reads, and return where it is.
 
-        Raises CertificateError where no claim is proved; ArtefactError when it cannot be written.
+        Raises
+        ------
+        CertificateError
+            Where no claim is proved.
+        ArtefactError
+            When it cannot be written.
         """
         return write_file(Path(path), self.to_bytes())
 
@@ -171,8 +188,12 @@ class Certificate:
 def read_certificate(path: Path) -> Certificate:
     """Read a certificate file.
 
-    Raises ArtefactError when the file cannot be read, or is no plain file; CertificateError when it
-    is too large, damaged or of another version.
+    Raises
+    ------
+    ArtefactError
+        When the file cannot be read, or is no plain file.
+    CertificateError
+        When it is too large, damaged or of another version.
     """
     remedy = "undertow certify NAME --out FOLDER writes one"
     size = check_file(path, "certificate", remedy=remedy)

@@ -38,7 +38,10 @@ class LoopClaim(Claim):
     def decide(self, mechanism: Mechanism, surface: Surface, law: ReachingLaw) -> Verdict:
         """Let the kernel decide it; the margin is the largest start of the first state that varies.
 
-        Raises Refused for numbers that do not fit the mechanism.
+        Raises
+        ------
+        Refused
+            For numbers that do not fit the mechanism.
         """
         model = model_of(mechanism)
         own = self._own(model)
@@ -76,7 +79,10 @@ class LoopClaim(Claim):
         With a held input the set is one of (q, p, s), which is linear in x near the target only:
         then W is of that.
 
-        Raises InvalidInputError for a claim that names none.
+        Raises
+        ------
+        InvalidInputError
+            For a claim that names none.
         """
         end = self._own(model_of(mechanism)).terminal
         if end is None:

@@ -102,7 +102,10 @@ def match(
 def check_settings(certificate: Certificate, settings: Mapping[str, float]) -> None:
     """Refuse a certificate whose parameters are not the stated ones.
 
-    Raises CertificateError with the first parameter that is unknown or has another value.
+    Raises
+    ------
+    CertificateError
+        With the first parameter that is unknown or has another value.
     """
     for name, value in settings.items():
         stated = certificate.parameters.get(name)

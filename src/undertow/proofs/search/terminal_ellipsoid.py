@@ -217,8 +217,10 @@ def terminal_sets(
 ) -> tuple[ProvedSet, ...]:
     """Return the terminal sets of surfaces, one for each that a proof is found for.
 
-    Raises InvalidInputError for a force that depends on time, or a switching function that is not
-    smooth at 0.
+    Raises
+    ------
+    InvalidInputError
+        For a force that depends on time, or a switching function that is not smooth at 0.
     """
     found = []
     for surface in surfaces:

@@ -45,8 +45,13 @@ class Definition:
         ``mechanism`` names the mechanism instead of the file.  It and ``code`` alone may be
         ``FILE.py:NAME``: a definition is data, and nothing that it says is run.
 
-        Raises ArtefactError for a file that cannot be read or is no TOML; InvalidInputError for a
-        mechanism that is missing, and for one in a Python file, which only ``mechanism`` may name.
+        Raises
+        ------
+        ArtefactError
+            For a file that cannot be read or is no TOML.
+        InvalidInputError
+            For a mechanism that is missing, and for one in a Python file, which only
+            ``mechanism`` may name.
         """
         content = read_file(path, "definition of a campaign", most=LARGEST)
         try:

@@ -103,7 +103,10 @@ def key_of(definition: Definition) -> str:
 def compute(definition: Definition, shard: int) -> Arrays:
     """Return the arrays of a shard: a pure function.
 
-    Raises InvalidInputError for a number that the campaign does not have.
+    Raises
+    ------
+    InvalidInputError
+        For a number that the campaign does not have.
     """
     study = study_of(definition)
     between("shard of the campaign", shard, 0, study.shards - 1)
@@ -177,8 +180,10 @@ class Campaign:
     def open(self, *, resume: bool = False) -> Store:
         """Return the store: a new one, or with ``resume`` the one that is there.
 
-        Raises ArtefactError when there is one and it is not to be resumed, none that could be, or
-        another one.
+        Raises
+        ------
+        ArtefactError
+            When there is one and it is not to be resumed, none that could be, or another one.
         """
         if resume:
             return Store(self.path, self.key, self.about)
@@ -199,7 +204,10 @@ class Campaign:
     def dataset(self) -> Any:
         """Return what the store has as an ``xarray.Dataset``, read lazily; of any version.
 
-        Raises ArtefactError when it is of another definition or mechanism.
+        Raises
+        ------
+        ArtefactError
+            When it is of another definition or mechanism.
         """
         data = dataset(self.path)
         for name, mine in self.about.items():
@@ -294,8 +302,12 @@ def executor_for(
 
     Yields the executor, and how many shards it computes at once.
 
-    Raises MissingExtraError without dask.distributed; ResourceError when the scheduler does not
-    answer, or has no workers.
+    Raises
+    ------
+    MissingExtraError
+        Without dask.distributed.
+    ResourceError
+        When the scheduler does not answer, or has no workers.
     """
     if not (workers or scheduler):
         if threads == 1:

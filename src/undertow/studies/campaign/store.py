@@ -95,7 +95,10 @@ class Store:
     def create(cls, path: Path, study: Study, key: str, about: dict[str, Any]) -> Store:
         """Make an empty store for a study; all of it is there, or nothing.
 
-        Raises ArtefactError when there is something already, or it cannot be written.
+        Raises
+        ------
+        ArtefactError
+            When there is something already, or it cannot be written.
         """
         if path.exists():
             raise ArtefactError(
@@ -140,7 +143,10 @@ class Store:
     def alone(self) -> Iterator[None]:
         """Keep every other process of this machine from running a campaign into this store.
 
-        Raises ArtefactError when another one does.
+        Raises
+        ------
+        ArtefactError
+            When another one does.
         """
         try:
             import fcntl
@@ -165,7 +171,10 @@ class Store:
     def write(self, study: Study, shard: int, arrays: Arrays) -> None:
         """Write the arrays of a shard, then its mark.
 
-        Raises ArtefactError when the system refuses, like a full disk: nothing is marked then.
+        Raises
+        ------
+        ArtefactError
+            When the system refuses, like a full disk: nothing is marked then.
         """
         try:
             for name, values in arrays.items():
@@ -177,7 +186,10 @@ class Store:
     def read(self, study: Study, shard: int) -> Arrays:
         """Return what the store has of a shard.
 
-        Raises ArtefactError for a chunk that cannot be read.
+        Raises
+        ------
+        ArtefactError
+            For a chunk that cannot be read.
         """
         try:
             return {name: self._arrays[name][study.part(shard)] for name in study.variables}
@@ -242,7 +254,12 @@ def digest(arrays: Arrays) -> int:
 def dataset(path: Path) -> Any:
     """Return a store as an ``xarray.Dataset``, read lazily; units and provenance in its attributes.
 
-    Raises ArtefactError when it is none; MissingExtraError without xarray.
+    Raises
+    ------
+    ArtefactError
+        When it is none.
+    MissingExtraError
+        Without xarray.
     """
     Store(path)
     xarray = require_extra("xarray", "campaign", "results are read with xarray")

@@ -109,7 +109,10 @@ class Study(ABC):
     def enter(self, code: Sequence[str]) -> None:
         """Take controllers of one's own, ``FILE.py:NAME``.
 
-        Raises InvalidInputError where the kind takes none.
+        Raises
+        ------
+        InvalidInputError
+            Where the kind takes none.
         """
         raise InvalidInputError(
             "controllers entered",

@@ -180,6 +180,9 @@ def figures() -> dict[str, Figure]:
 def files() -> dict[str, bytes]:
     """Return the tables and Figures 7-11 as files, by name.
 
-    Raises MissingExtraError where ``undertow[appendix]`` is not installed.
+    Raises
+    ------
+    MissingExtraError
+        Where ``undertow[appendix]`` is not installed.
     """
     return {"appendix.md": markdown().encode(), **figure_files(figures(), ("png", "pdf"))}

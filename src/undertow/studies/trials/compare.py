@@ -56,8 +56,12 @@ def nmpc(mechanism: Mechanism, objective: Objective, **settings: Any) -> MakeCon
 
     ``settings`` are those of :class:`undertow.studies.trials.steering.NMPC`.
 
-    Raises InvalidInputError for an objective that does not rise with every input, such as least
-    time; MissingExtraError without CasADi.
+    Raises
+    ------
+    InvalidInputError
+        For an objective that does not rise with every input, such as least time.
+    MissingExtraError
+        Without CasADi.
     """
     return predictive(mechanism, objective.on(mechanism), **settings)
 
@@ -92,7 +96,10 @@ class Comparison:
     def to_pandas(self) -> Any:
         """Return a ``pandas.DataFrame`` with a row for each run.
 
-        Raises MissingExtraError without pandas.
+        Raises
+        ------
+        MissingExtraError
+            Without pandas.
         """
         pandas = require_extra("pandas", "interop", "data frames need pandas")
         return pandas.DataFrame(self.rows)
