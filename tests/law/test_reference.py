@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import sympy as sp
 from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicHermiteSpline
 
 import undertow as ut
 from undertow.base import ArtefactError, InvalidInputError
@@ -106,6 +107,22 @@ def test_the_upright_pendulum_leans_before_the_arm_starts() -> None:
     t = np.linspace(0.5, 5.5, 2001)  # rates belong to positions, between rows too
     rows = asked.rows(t)
     assert np.abs(np.gradient(rows[:, 1], t)[1:-1] - rows[1:-1, 3]).max() < 1e-4
+
+
+def test_between_its_rows_a_motion_is_cubic_and_it_rests_before_and_after() -> None:
+    rng = np.random.default_rng(0)
+    t = np.cumsum(rng.uniform(0.01, 1.0, 20)) - 2.0
+    q, v, a = rng.normal(size=(3, 20, 2))
+    asked, inside = ReferenceMotion(t, q, v, a), np.append(rng.uniform(t[0], t[-1], 100), t)
+    rows = asked.rows(inside)
+    assert rows[:, :2] == pytest.approx(CubicHermiteSpline(t, q, v)(inside), abs=1e-12)
+    assert rows[:, 2:4] == pytest.approx(CubicHermiteSpline(t, v, a)(inside), abs=1e-12)
+    linear = np.stack([np.interp(inside, t, column) for column in a.T], axis=1)
+    assert rows[:, 4:] == pytest.approx(linear, abs=1e-12)
+    still = np.zeros(4)
+    expected = [[*q[0], *still], [*q[-1], *still]]
+    assert asked.rows([t[0] - 5.0, t[-1] + 1e4]).tolist() == expected
+    assert ReferenceMotion.at_rest(q[0]).rows(2.0).tolist() == [[*q[0], *still]]
 
 
 def test_a_swing_is_given_damping_that_it_lacks() -> None:

@@ -16,7 +16,6 @@ from undertow.cascade import CascadeState
 from undertow.law import ReferenceMotion
 from undertow.runtime import Recipe, Request, Settings, send_target, session
 from undertow.runtime.encoding import memory_from, memory_to, reference_from, reference_to
-from undertow.runtime.steps import reference_row
 from undertow.runtime.workers import Packer
 
 SINE = ut.Reference.sine(0.25, theta=ut.deg(20))
@@ -109,18 +108,6 @@ def test_against_the_clock_processes_share_the_reference(tmp_path: Path) -> None
     assert arm < 3.0
     with pytest.raises(ut.base.ArtefactError):
         send_target(log, {"theta": 0.0})
-
-
-def test_a_step_finds_the_reference_where_the_library_does() -> None:
-    """On its grid, between, before and after; and at rest."""
-    found, here = np.empty(6), motion()
-    times = [-5.0, here.t[0], 0.0, 0.12345, 3.99, *here.t[5:8], here.t[-1], 1e4]
-    for t in times:
-        reference_row(t, here.t, here.q, here.v, here.a, found)
-        assert found == pytest.approx(here.rows(t)[0], abs=1e-14)
-    rest = ReferenceMotion.at_rest(np.array([0.3, 0.0]))
-    reference_row(2.0, rest.t, rest.q, rest.v, rest.a, found)
-    assert found.tolist() == [0.3, 0.0, 0.0, 0.0, 0.0, 0.0]
 
 
 def test_the_slow_loop_predicts_along_the_reference() -> None:

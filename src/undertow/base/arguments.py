@@ -75,30 +75,18 @@ BY_NAME = "Set states by name: mechanism.state(name=value)"
 def floats(what: str, values: ArrayLike, remedy: str = BY_NAME) -> np.typing.NDArray[np.float64]:
     """Return values as an array of floats, or refuse them.
 
-    Raises
-    ------
-    InvalidInputError
-        With what was given instead.
+    Raises InvalidInputError with what was given instead.
     """
     if _is_array(values) and not np.ma.is_masked(values):  # NumPy would hand over what is hidden
         return np.asarray(values, dtype=np.float64)
-    raise InvalidInputError(
-        what,
-        value=_shown(values),
-        limit="numbers, in SI units",
-        remedy=remedy,
-    )
+    raise InvalidInputError(what, value=_shown(values), limit="numbers, in SI units", remedy=remedy)
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
     """Have every argument of a function or method checked against its annotation.
 
-    Numbers of SymPy and of other kinds become floats where these are asked for.
-
-    Raises
-    ------
-    InvalidInputError
-        At a call, for an argument of another type, by name.
+    Numbers of SymPy and of other kinds become floats where these are asked for. Raises
+    InvalidInputError at a call, for an argument of another type, by name.
 
     Examples
     --------
@@ -181,10 +169,7 @@ def require(
 ) -> None:
     """Refuse what is not as it has to be.
 
-    Raises
-    ------
-    InvalidInputError
-        Or another ``error``, with the value, the limit and the remedy.
+    Raises InvalidInputError or another ``error``, with the value, the limit and the remedy.
     """
     if not good:
         raise error(what, value=value, limit=limit, remedy=remedy)
@@ -193,10 +178,7 @@ def require(
 def at_least(what: str, value: float, low: float, remedy: str = "") -> None:
     """Refuse a number below a limit, and NaN.
 
-    Raises
-    ------
-    InvalidInputError
-        With the value and the limit.
+    Raises InvalidInputError with the value and the limit.
     """
     if not value >= low:  # in loops: the words are made where they are needed
         remedy = remedy or f"Any whole number from {low:g} will do"
@@ -208,10 +190,7 @@ def between(
 ) -> None:
     """Refuse a number outside of an interval, and NaN.
 
-    Raises
-    ------
-    InvalidInputError
-        With the value and the limits.
+    Raises InvalidInputError with the value and the limits.
     """
     if not low <= value <= high:
         shown = (f"{number:g} {unit}".rstrip() for number in (value, low, high))
@@ -222,10 +201,7 @@ def between(
 def instant(t: float) -> None:
     """Refuse a time that is not finite.
 
-    Raises
-    ------
-    InvalidInputError
-        With the value.
+    Raises InvalidInputError with the value.
     """
     require(math.isfinite(t), "time, s", t, "a finite number", "Give the clock's, s from the start")
 
@@ -235,21 +211,9 @@ def positive(
 ) -> None:
     """Refuse numbers that are not finite and > 0, NaN always.
 
-    Parameters
-    ----------
-    what
-        What the number is, for the message.
-    value
-        A number or an array.
-    remedy
-        What to do, as a sentence.
-    zero, infinite
-        Allow 0; allow infinity.
-
-    Raises
-    ------
-    InvalidInputError
-        With the value and the limit.
+    ``what``: what the number is, for the message. ``value``: a number or an array. ``remedy``: what
+    to do, as a sentence. ``zero``, ``infinite``: allow 0; allow infinity. Raises InvalidInputError
+    with the value and the limit.
     """
     if isinstance(value, float) and 0.0 < value < math.inf:
         return  # the usual case, in loops
@@ -265,12 +229,8 @@ def one_for_each(
 ) -> np.typing.NDArray[np.float64]:
     """Return positive numbers, (count,), from one for all of them or one for each.
 
-    ``zero``: it may be 0, ``infinite``: infinity too.
-
-    Raises
-    ------
-    InvalidInputError
-        For another shape, and for what :func:`positive` refuses.
+    ``zero``: it may be 0, ``infinite``: infinity too. Raises InvalidInputError for another shape,
+    and for what :func:`positive` refuses.
     """
     numbers, remedy = np.asarray(values, dtype=np.float64), "One number serves all"
     if numbers.shape not in ((), (count,)):
@@ -288,10 +248,7 @@ def one_of(
 ) -> None:
     """Refuse a name that is none of those known; the message names those that are like it.
 
-    Raises
-    ------
-    InvalidInputError
-        Or another ``error``, with all that are known.
+    Raises InvalidInputError or another ``error``, with all that are known.
     """
     known = list(names)
     if name not in known:
@@ -302,12 +259,8 @@ def one_of(
 def check_fields(instance: Any, *names: str) -> None:
     """Check the fields of a dataclass, all or those named, against their annotations.
 
-    As in :func:`checked` numbers become floats where these are asked for.
-
-    Raises
-    ------
-    InvalidInputError
-        For a field of another type, by name.
+    As in :func:`checked` numbers become floats where these are asked for. Raises InvalidInputError
+    for a field of another type, by name.
     """
     owner: Any = type(instance)
     tests = _tests(owner)

@@ -222,10 +222,7 @@ def file_name(name: str) -> str:
 def check_folder(folder: Path) -> None:
     """Make the folder and prove that it can be written, before any long work.
 
-    Raises
-    ------
-    ArtefactError
-        When it cannot.
+    Raises ArtefactError when it cannot.
     """
     refusal = "a folder that can be written", "Name another one with --out"
     with or_refused(f"results folder '{folder}'", *refusal):
@@ -248,12 +245,8 @@ def whole(path: Path) -> Iterator[Path]:
 def check_replaces(path: Path, begins: bytes) -> None:
     """Refuse to write over a file of another kind: one that does not begin as the new one does.
 
-    A log or a definition that is named by mistake is not lost.
-
-    Raises
-    ------
-    ArtefactError
-        Where there is one.
+    A log or a definition that is named by mistake is not lost. Raises ArtefactError where there is
+    one.
     """
     if not path.is_file():
         return
@@ -271,10 +264,7 @@ def check_replaces(path: Path, begins: bytes) -> None:
 def check_place(path: Path, begins: bytes) -> None:
     """Prove that a file that begins so can be written at a place, before any long work.
 
-    Raises
-    ------
-    ArtefactError
-        As for :func:`write_file`.
+    Raises ArtefactError as for :func:`write_file`.
     """
     _check_kind(path, begins)
     with or_refused(f"file '{path}'", *_WRITABLE):
@@ -300,11 +290,8 @@ def _check_kind(path: Path, begins: bytes) -> None:
 def write_file(path: Path, content: bytes) -> Path:
     """Write one file, whole or not at all, in place of an earlier one; return where it is.
 
-    Raises
-    ------
-    ArtefactError
-        When it cannot be written, where a file of another kind is there, and for a picture whose
-        name ends as that of another kind.
+    Raises ArtefactError when it cannot be written, where a file of another kind is there, and for a
+    picture whose name ends as that of another kind.
     """
     begins = content[: 1 if content.startswith(b"{") else 4]  # JSON may be laid out in several ways
     _check_kind(path, begins)
@@ -321,22 +308,9 @@ def write_file(path: Path, content: bytes) -> Path:
 def write_files(folder: Path, files: Mapping[str, bytes]) -> Path | None:
     """Write files, each whole or not at all, after moving earlier ones of the same names.
 
-    Parameters
-    ----------
-    folder
-        Made where it is not there.
-    files
-        Names to contents; a name may have folders in it, divided by "/".
-
-    Returns
-    -------
-    Path or None
-        The folder that earlier files were moved to, if there were any.
-
-    Raises
-    ------
-    ArtefactError
-        When the disk refuses.
+    ``folder``: made where it is not there. ``files``: names to contents; a name may have folders in
+    it, divided by "/". Returns the folder that earlier files were moved to, if there were any.
+    Raises ArtefactError when the disk refuses.
     """
     check_folder(folder)
     try:

@@ -86,10 +86,7 @@ class MissingExtraError(UndertowError, ImportError):
 def require_extra(module: str, extra: str, need: str) -> Any:
     """Import an optional dependency, or say in one line what needs it and how to install it.
 
-    Raises
-    ------
-    MissingExtraError
-        When it is not installed.
+    Raises MissingExtraError when it is not installed.
     """
     try:
         return importlib.import_module(module)
@@ -109,10 +106,7 @@ class ResourceError(UndertowError, OSError):
 def or_refused(what: str, limit: str, remedy: str) -> Iterator[None]:
     """Turn what the system refuses about a file into one condition.
 
-    Raises
-    ------
-    ArtefactError
-        With the system's own words.
+    Raises ArtefactError with the system's own words.
     """
     try:
         yield
@@ -165,17 +159,8 @@ def near(name: str, names: Iterable[str]) -> str:
 def raised_at(error: BaseException, file: str = "") -> str:
     """Return ", FILE line N" of the innermost line of a user's own that an error went through.
 
-    Parameters
-    ----------
-    error
-        With its traceback.
-    file
-        The user's file; where it is left out, any outside of Undertow and of installed packages.
-
-    Returns
-    -------
-    str
-        Empty where there is no such line.
+    ``error``: with its traceback. ``file``: the user's file; where it is left out, any outside of
+    Undertow and of installed packages. Empty where there is no such line.
     """
     if isinstance(error, SyntaxError) and error.lineno and error.filename == file:
         return f", {file} line {error.lineno}"

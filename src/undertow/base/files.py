@@ -23,23 +23,9 @@ def check_file(path: Path, what: str, *, most: int = 1 << 40, remedy: str = "") 
     """Return the size of a plain file, bytes; anything else is refused before it is opened.
 
     Opening a pipe waits for its writer, reading a device may never end, and opening some devices
-    changes their state.
-
-    Parameters
-    ----------
-    path
-        A file, or a link to one.
-    what
-        For messages, like ``"log"``.
-    most
-        Largest size, bytes.
-    remedy
-        What to do where there is no such file.
-
-    Raises
-    ------
-    ArtefactError
-        For what is missing, no plain file, or too large.
+    changes their state. ``path``: a file, or a link to one. ``what``: for messages, like ``"log"``.
+    ``most``: largest size, bytes. ``remedy``: what to do where there is no such file. Raises
+    ArtefactError for what is missing, no plain file, or too large.
     """
     try:
         facts = os.stat(path)
@@ -79,10 +65,7 @@ def _kind(mode: int) -> str:
 def read_file(path: Path, what: str, *, most: int, remedy: str = "") -> bytes:
     """Return the content of a file, see :func:`check_file`.
 
-    Raises
-    ------
-    ArtefactError
-        For what cannot be read, is no plain file, or too large.
+    Raises ArtefactError for what cannot be read, is no plain file, or too large.
     """
     check_file(path, what, most=most, remedy=remedy)
     with or_refused(f"{what} '{path}'", "a file that can be read", remedy or "Check the path"):
@@ -98,10 +81,7 @@ def read_file(path: Path, what: str, *, most: int, remedy: str = "") -> bytes:
 def file_hash(path: Path, what: str) -> str:
     """Return SHA-256 of a file's content, in hexadecimal digits.
 
-    Raises
-    ------
-    ArtefactError
-        As for :func:`read_file`.
+    Raises ArtefactError as for :func:`read_file`.
     """
     return hashlib.sha256(read_file(path, what, most=HASHED)).hexdigest()
 
@@ -109,17 +89,8 @@ def file_hash(path: Path, what: str) -> str:
 def parse_json(content: str | bytes, *, finite: bool = True) -> Any:
     """Parse JSON strictly: no repeated keys, no overlong numbers, no deep nesting.
 
-    Parameters
-    ----------
-    content
-        Text, or its UTF-8.
-    finite
-        Refuse NaN and infinities, which Python's JSON can write.
-
-    Raises
-    ------
-    ValueError
-        With what is wrong.
+    ``content``: text, or its UTF-8. ``finite``: refuse NaN and infinities, which Python's JSON can
+    write. Raises ValueError with what is wrong.
     """
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

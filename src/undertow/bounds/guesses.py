@@ -14,6 +14,7 @@ from undertow.base import InvalidInputError
 from undertow.closed_loop import Trajectory
 from undertow.models import FloatArray, Mechanism, linearise
 from undertow.models.importers import holding_input
+from undertow.objective import finite_limits
 
 
 class Guess(NamedTuple):
@@ -101,7 +102,7 @@ def _held(mechanism: Mechanism) -> Callable[[FloatArray], FloatArray]:
 def _regulated(mechanism: Mechanism, x0: FloatArray, scale: float, longest: float) -> Guess | None:
     """Simulate linear-quadratic feedback, clipped; None where it does not arrive."""
     lin, limits, rest = linearise(mechanism), mechanism.input_limits, holding_input(mechanism)
-    weight = np.diag(1.0 / np.where(np.isfinite(limits), limits, 1.0) ** 2)
+    weight = np.diag(1.0 / finite_limits(mechanism) ** 2)
     try:
         P = scipy.linalg.solve_continuous_are(lin.A, lin.input, np.eye(2 * mechanism.n), weight)
     except np.linalg.LinAlgError:

@@ -40,10 +40,7 @@ def adapted_mesh(
     """
     jumps = (np.abs(np.diff(inputs, axis=0)) / (1e-12 + np.ptp(inputs, axis=0))).max(axis=1)
     shares = np.full(len(errors), 0.25 / len(errors))
-    for weight, share in (
-        (0.45, np.maximum(errors, 1e-14) ** 0.2),
-        (0.3, np.sqrt(jumps + 1e-12)),
-    ):
+    for weight, share in ((0.45, np.maximum(errors, 1e-14) ** 0.2), (0.3, np.sqrt(jumps + 1e-12))):
         shares += weight * share / share.sum()
     at = np.concatenate([[0.0], np.cumsum(shares)])
     return np.interp(np.linspace(0.0, at[-1], count + 1), at, mesh)

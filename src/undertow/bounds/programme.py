@@ -16,7 +16,7 @@ from undertow.bounds.guesses import Guess, rests, time_scale
 from undertow.bounds.mesh import adapted_mesh, defects, first_mesh
 from undertow.models import FloatArray, Mechanism, require_smooth
 from undertow.models.importers import holding_input
-from undertow.objective import Objective
+from undertow.objective import Objective, finite_limits
 
 #: Largest defect (see ``Bound.defect``) that a result may have: coarse meshes let a
 #: programme "move" in ways that the mechanism cannot.
@@ -129,7 +129,7 @@ class Programme:
         #: Whether another place may cost less than the target: a motion may wait there.
         self.waits = not self.rest_costs or any(stage.diff(u).subs(target) != 0 for u in held)
         self.scale = time_scale(mechanism, longest)
-        limits = np.where(np.isfinite(mechanism.input_limits), mechanism.input_limits, 1.0)
+        limits = finite_limits(mechanism)
         self.units = limits / PARTS  # of the inputs as unknowns
         # ∫ effort dt weighs every input, from the one that holds the target, by its limit.
         effort = sum(((u - held[u]) / limit) ** 2 for u, limit in zip(held, limits, strict=True))

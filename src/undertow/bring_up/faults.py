@@ -148,12 +148,8 @@ def rig_named(
 
     The word is ``realistic``, ``ideal`` or ``FILE.py:NAME``; a simulated one moves as ``truth``
     says and begins at rest, (2n,), and friction among the faults is put into its bench, see
-    :func:`.faults.rubbing`; the seed is a realistic one's.
-
-    Raises
-    ------
-    InvalidInputError
-        For another word, for faults on a rig of one's own, and for friction on the ideal one.
+    :func:`.faults.rubbing`; the seed is a realistic one's. Raises InvalidInputError for another
+    word, for faults on a rig of one's own, and for friction on the ideal one.
     """
     if in_a_file(word):
         if faults:

@@ -62,11 +62,7 @@ class Identification:
 
 
 def identify(
-    mechanism: Mechanism,
-    x0: FloatArray,
-    record: MotionRecord,
-    *,
-    progress: Progress = no_progress,
+    mechanism: Mechanism, x0: FloatArray, record: MotionRecord, *, progress: Progress = no_progress
 ) -> Identification:
     """Identify parameters of a mechanism from a motion that begins at rest.
 

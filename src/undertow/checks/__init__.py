@@ -6,7 +6,4 @@ arithmetic on the same expressions. In Python: ``ut.check_mechanism(mechanism)``
 
 from undertow.checks.check import MechanismReport, check_mechanism
 
-__all__ = [
-    "MechanismReport",
-    "check_mechanism",
-]
+__all__ = ["MechanismReport", "check_mechanism"]

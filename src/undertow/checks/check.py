@@ -8,7 +8,7 @@ surface of this kind can stabilise the target, and the condition says why and wh
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -220,7 +220,7 @@ def _positions(mechanism: Mechanism, rng: np.random.Generator, samples: int) -> 
     return rng.uniform(np.minimum(low, high), np.maximum(low, high), (samples, mechanism.n))
 
 
-def _inertia(mechanism: Mechanism, q: FloatArray) -> tuple[Check, ...]:
+def _inertia(mechanism: Mechanism, q: FloatArray) -> Iterator[Check]:
     M = mechanism.M(q)
     gap = float(np.abs(M - np.swapaxes(M, -1, -2)).max() / np.abs(M).max())
     diagonal = np.diagonal(M, axis1=-2, axis2=-1)
@@ -231,28 +231,15 @@ def _inertia(mechanism: Mechanism, q: FloatArray) -> tuple[Check, ...]:
         scaled = M / (root[..., :, None] * root[..., None, :])
         smallest = float(np.linalg.eigvalsh(scaled)[..., 0].min())
     foreign = mechanism.mass_matrix.free_symbols - {*mechanism.q, *mechanism.parameter_symbols}
-    return (
-        _small(
-            "M is symmetric, |M − Mᵀ|",
-            gap,
-            "of |M|",
-            "Multiply the equations so that they are Lagrange's, row by row",
-        ),
-        _large(
-            "M > 0, smallest eigenvalue with M scaled to unit diagonal",
-            smallest,
-            "",
-            "Check masses, lengths and inertias: a massless link has no M > 0",
-        ),
-        _none(
-            "M depends on q only, other symbols",
-            foreign,
-            "Move what depends on velocity or time to f",
-        ),
-    )
+    remedy = "Multiply the equations so that they are Lagrange's, row by row"
+    yield _small("M is symmetric, |M − Mᵀ|", gap, "of |M|", remedy)
+    remedy = "Check masses, lengths and inertias: a massless link has no M > 0"
+    yield _large("M > 0, smallest eigenvalue with M scaled to unit diagonal", smallest, "", remedy)
+    remedy = "Move what depends on velocity or time to f"
+    yield _none("M depends on q only, other symbols", foreign, remedy)
 
 
-def _forces(mechanism: Mechanism, q: FloatArray, qd: FloatArray) -> tuple[Check, ...]:
+def _forces(mechanism: Mechanism, q: FloatArray, qd: FloatArray) -> Iterator[Check]:
     """Split f into what is even and odd in q̇; the even part is Lagrange's, the odd part damps."""
     n = mechanism.n
     ahead = mechanism.f(np.hstack([q, qd]))
@@ -267,36 +254,25 @@ def _forces(mechanism: Mechanism, q: FloatArray, qd: FloatArray) -> tuple[Check,
     scale = float(np.abs(c).max() + np.abs(rest).max() + np.abs(odd).max()) or 1.0
     coriolis = float(np.abs(even - rest + c).max()) / scale
     power = np.einsum("si,si->s", odd, qd)
-    checks = [
-        _small(
-            "velocity-dependent forces are Lagrange's (Ṁ − 2C skew-symmetric), residual",
-            coriolis,
-            "of |f|",
-            "Derive f from M: Mechanism.from_energies does it",
-        )
-    ]
+    yield _small(
+        "velocity-dependent forces are Lagrange's (Ṁ − 2C skew-symmetric), residual",
+        coriolis,
+        "of |f|",
+        "Derive f from M: Mechanism.from_energies does it",
+    )
     if mechanism.potential is not None:
         gradient = [sp.diff(mechanism.potential, symbol) for symbol in mechanism.q]
         dV = _evaluated(mechanism, gradient, q)
         balance = float(np.abs(rest + dV).max()) / scale
-        checks.append(
-            _small(
-                "forces at rest are −∂V/∂q, so the rate of energy is the power, residual",
-                balance,
-                "of |f|",
-                "Correct the potential, or leave it out",
-            )
+        yield _small(
+            "forces at rest are −∂V/∂q, so the rate of energy is the power, residual",
+            balance,
+            "of |f|",
+            "Correct the potential, or leave it out",
         )
     worst = float(power.max()) / (scale * float(np.abs(qd).max()) * n)
-    checks.append(
-        _small(
-            "damping takes energy, largest power",
-            worst,
-            "of |f| |q̇|",
-            "Check the signs of damping: forces odd in q̇ must oppose the motion",
-        )
-    )
-    return tuple(checks)
+    remedy = "Check the signs of damping: forces odd in q̇ must oppose the motion"
+    yield _small("damping takes energy, largest power", worst, "of |f| |q̇|", remedy)
 
 
 def _evaluated(mechanism: Mechanism, expressions: Iterable[sp.Expr], q: FloatArray) -> FloatArray:
@@ -319,45 +295,39 @@ def _inverse(
     wanted = np.hstack([u @ mechanism.B.T, np.zeros((len(q), mechanism.n - mechanism.m))])
     scale = float(np.abs(forces).max() + np.abs(mechanism.f(x)).max()) or 1.0
     residual = float(np.abs(forces - wanted).max()) / scale
-    return _small(
-        "inverse dynamics undo forward dynamics, residual",
-        residual,
-        "of |f|",
-        "M is close to singular somewhere: check masses and inertias",
-    )
+    remedy = "M is close to singular somewhere: check masses and inertias"
+    return _small("inverse dynamics undo forward dynamics, residual", residual, "of |f|", remedy)
 
 
-def _target(mechanism: Mechanism) -> tuple[Check, ...]:
+def _target(mechanism: Mechanism) -> Iterator[Check]:
     n, m = mechanism.n, mechanism.m
     rest = mechanism.f(np.zeros(2 * n))
     outside = [c.name for c in mechanism.coordinates if not c.low <= 0 <= c.high]
     left = float(np.abs(rest[m:]).max()) / force_scale(mechanism)
     effort = float(np.max(np.abs(np.linalg.solve(mechanism.B, rest[:m])) / mechanism.input_limits))
-    checks = [
-        _none(
-            "target x = 0 lies within the ranges, coordinates outside",
-            outside,
-            f"Range of {', '.join(outside)}: move the target, or correct the range",
-        ),
-        _small(
-            "target x = 0 is an equilibrium of the free coordinates, |f_u(0, 0)|",
-            left,
-            "of |f| at rest",
-            ("" if left <= _ROUNDING else f"{nearest_equilibrium(mechanism)}. ")
-            + "Shift the coordinates: undertow.models.importers.find_equilibrium and move_target",
-        ),
-        Check(
-            "inputs can hold the target, |B⁻¹ f_a(0, 0)| of their limits",
-            effort < 1,
-            effort,
-            "< 1",
-            "Choose a stronger actuator, or another target",
-        ),
-    ]
+    remedy = f"Range of {', '.join(outside)}: move the target, or correct the range"
+    yield _none("target x = 0 lies within the ranges, coordinates outside", outside, remedy)
+    yield _small(
+        "target x = 0 is an equilibrium of the free coordinates, |f_u(0, 0)|",
+        left,
+        "of |f| at rest",
+        ("" if left <= _ROUNDING else f"{nearest_equilibrium(mechanism)}. ")
+        + "Shift the coordinates: undertow.models.importers.find_equilibrium and move_target",
+    )
+    yield Check(
+        "inputs can hold the target, |B⁻¹ f_a(0, 0)| of their limits",
+        effort < 1,
+        effort,
+        "< 1",
+        "Choose a stronger actuator, or another target",
+    )
     if left > _ROUNDING:
-        return tuple(checks)
-    if not has_linear_model(mechanism):
-        kink = Check(
+        return
+    if has_linear_model(mechanism):
+        yield _equilibria(mechanism)
+        yield _controllable(mechanism)
+    else:
+        yield Check(
             "forces have a derivative at the target, kinks",
             False,
             1.0,
@@ -365,8 +335,6 @@ def _target(mechanism: Mechanism) -> tuple[Check, ...]:
             "Abs, sign, Max, Min and the like: without a linear model no surface is designed or "
             "tested; simulate with a surface of your own, or put smooth functions in their place",
         )
-        return (*checks, kink)
-    return (*checks, _equilibria(mechanism), _controllable(mechanism))
 
 
 def _equilibria(mechanism: Mechanism) -> Check:
@@ -411,37 +379,23 @@ def _controllable(mechanism: Mechanism) -> Check:
     )
 
 
-def _limits(mechanism: Mechanism) -> tuple[Check, ...]:
+def _limits(mechanism: Mechanism) -> Iterator[Check]:
     """Report inputs without a limit: they are allowed, but minimum time needs limits."""
     endless = [i.name for i in mechanism.inputs if math.isinf(i.limit)]
-    if not endless:
-        return ()
-    name = f"inputs without a limit ({', '.join(endless)}), number"
-    limit = "0 of a real actuator: with_input_limit gives one"
-    return (Check(name, True, float(len(endless)), limit),)
+    if endless:
+        name = f"inputs without a limit ({', '.join(endless)}), number"
+        limit = "0 of a real actuator: with_input_limit gives one"
+        yield Check(name, True, float(len(endless)), limit)
 
 
-def _start(mechanism: Mechanism) -> tuple[Check, ...]:
+def _start(mechanism: Mechanism) -> Iterator[Check]:
     if not mechanism.start:
-        return ()
+        return
     x = mechanism.state(**mechanism.start)
-    outside = [
-        c.name
-        for c, value in zip(mechanism.coordinates, x, strict=False)
-        if not c.low <= value <= c.high
-    ]
+    places = zip(mechanism.coordinates, x, strict=False)
+    outside = [c.name for c, value in places if not c.low <= value <= c.high]
+    remedy = f"Range of {', '.join(outside)}: start closer, or correct the range"
+    yield _none("start state lies within the ranges, coordinates outside", outside, remedy)
     size = float(np.linalg.norm(x))
-    return (
-        _none(
-            "start state lies within the ranges, coordinates outside",
-            outside,
-            f"Range of {', '.join(outside)}: start closer, or correct the range",
-        ),
-        Check(
-            "start state is not the target, ‖x‖",
-            size > 0,
-            size,
-            "> 0",
-            "Declare a start state to move from",
-        ),
-    )
+    remedy = "Declare a start state to move from"
+    yield Check("start state is not the target, ‖x‖", size > 0, size, "> 0", remedy)

@@ -177,10 +177,7 @@ _FUNCTIONS: Mapping[Any, Callable[[Number], Number]] = {
 def evaluate(expression: sp.Basic, known: dict[sp.Basic, Number]) -> Number:
     """Return the value of an expression; ``known`` starts with its symbols, and remembers.
 
-    Raises
-    ------
-    ModelError
-        For a symbol without a value, or a function that is not known here.
+    Raises ModelError for a symbol without a value, or a function that is not known here.
     """
     e = sp.sympify(expression)
     if e not in known:
@@ -303,10 +300,7 @@ class ExactLaw(NamedTuple):
 class ExactModel:
     """A mechanism's own expressions, with its parameters, in 50 digits.
 
-    Raises
-    ------
-    ModelError
-        When one symbol stands for two of its coordinates, inputs and parameters.
+    Raises ModelError when one symbol stands for two of its coordinates, inputs and parameters.
     """
 
     def __init__(self, mechanism: Mechanism) -> None:

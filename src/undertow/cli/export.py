@@ -282,11 +282,7 @@ def _estimator(
     name="log",
     of=export,
 )
-def export_log(
-    log: Path,
-    mcap: Path | None = None,
-    parquet: Path | None = None,
-) -> None:
+def export_log(log: Path, mcap: Path | None = None, parquet: Path | None = None) -> None:
     """Write the log of a run for other programs, with units: every step, answer and event.
 
     Parameters

@@ -16,9 +16,7 @@ from undertow.optimiser import Optimiser
 
 
 @command("undertow mechanisms", "undertow mechanisms --out pictures", name="mechanisms")
-def list_mechanisms(
-    out: Path | None = None,
-) -> None:
+def list_mechanisms(out: Path | None = None) -> None:
     """List the mechanisms of the library; with --out also draw them.
 
     Parameters
@@ -43,11 +41,7 @@ def list_mechanisms(
     "undertow derive acrobot --out formulas",
     "undertow derive model.py:bar",
 )
-def derive(
-    name: options.AnyName,
-    latex: bool = False,
-    out: Path | None = None,
-) -> None:
+def derive(name: options.AnyName, latex: bool = False, out: Path | None = None) -> None:
     """Show M, f, the law and the surface conditions as formulas.
 
     Parameters
@@ -110,10 +104,7 @@ def survey(
 
 @command("undertow models robots", "undertow models robots --no-simulate --out tables")
 def models(
-    folder_of_files: Path,
-    simulate: bool = True,
-    seed: options.Seed = 0,
-    out: Path | None = None,
+    folder_of_files: Path, simulate: bool = True, seed: options.Seed = 0, out: Path | None = None
 ) -> None:
     """Read every URDF and MJCF file of a folder: what is balanced, and what is not and why.
 

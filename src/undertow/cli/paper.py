@@ -9,15 +9,9 @@ from undertow.cli.terminal import carry_out, command
 
 
 @command(
-    "undertow reproduce",
-    "undertow reproduce --out results --seed 1",
-    "undertow reproduce --quick",
+    "undertow reproduce", "undertow reproduce --out results --seed 1", "undertow reproduce --quick"
 )
-def reproduce(
-    out: Path = Path("results"),
-    seed: options.Seed = 0,
-    quick: bool = False,
-) -> None:
+def reproduce(out: Path = Path("results"), seed: options.Seed = 0, quick: bool = False) -> None:
     """Run the paper's experiment: Tables 1 and 2 beside the paper's, Figures 3 to 6.
 
     Also its appendix, corrected: tables of the five cases and Figures 7 to 11 (not with --quick).

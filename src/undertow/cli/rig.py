@@ -285,10 +285,7 @@ def _say_where_to_ask(log: Path, deaf: str, free: Sequence[Coordinate]) -> None:
     "undertow target run.db x=0.5m x=-0.5m@8s",
     "undertow target run.db",
 )
-def target(
-    log: Path,
-    points: Annotated[list[str] | None, typer.Argument()] = None,
-) -> None:
+def target(log: Path, points: Annotated[list[str] | None, typer.Argument()] = None) -> None:
     """Give a run that goes on another target.
 
     The run, started with --log in another terminal of this machine, checks
@@ -334,10 +331,7 @@ def _places(run: RunTarget, q: Mapping[str, float]) -> str:
     "undertow replay run.db --mechanism my_arm.py:arm",
 )
 def replay(
-    log: Path,
-    mechanism: str | None = None,
-    decisions: bool = True,
-    out: Path | None = None,
+    log: Path, mechanism: str | None = None, decisions: bool = True, out: Path | None = None
 ) -> None:
     """Replay a log with the same build, and compare the outputs bit for bit.
 

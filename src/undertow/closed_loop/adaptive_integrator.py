@@ -353,13 +353,7 @@ def look_source(program: LoopGraph, *, header: str) -> str:
     ``decide`` evaluates the law at a state: u, and into ``seen`` s, demand, det Γ(q)/det Γ(0), the
     margin of a hard input limit and, behind them, those of the path constraints.  ``look`` gives
     the rates of state and cost and the margins of the path; a continuous one decides first.
-
-    Parameters
-    ----------
-    program
-        The closed loop.
-    header
-        Text for the module's docstring.
+    ``program``: the closed loop. ``header``: text for the module's docstring.
     """
     emit, one = Emitter(program.tape), sp.Float(1.0)
     margin = one if program.input_margin is None else program.input_margin

@@ -18,13 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from undertow.base import (
-    ArtefactError,
-    MissingExtraError,
-    ResourceError,
-    checked,
-    require_extra,
-)
+from undertow.base import ArtefactError, MissingExtraError, ResourceError, checked, require_extra
 from undertow.closed_loop.kernel import build_loop_graph
 from undertow.closed_loop.kernel_source import kernel_source
 from undertow.closed_loop.rollout import ClosedLoop
@@ -82,12 +76,8 @@ def on_gpu(loop: ClosedLoop, compiler: Literal["nvrtc", "host"] = "nvrtc") -> Cl
 class CudaText:
     """The kernel of a closed loop as CUDA C++, and how it is called.
 
-    Attributes
-    ----------
-    text
-        The module; its entry is ``rollout_all(count, …)``.
-    shapes
-        Lengths that follow the parameters: (array, axis).
+    ``text``: the module; its entry is ``rollout_all(count, …)``. ``shapes``: lengths that follow
+    the parameters: (array, axis).
     """
 
     def __init__(self, loop: ClosedLoop) -> None:

@@ -97,21 +97,9 @@ def axis(trajectory: Trajectory, name: str) -> tuple[FloatArray, str]:
 def state_series(axes: Axes, trajectory: Trajectory, name: str, **line: Any) -> None:
     """Draw a state over time, in degrees where it is an angle, and label the axis.
 
-    Parameters
-    ----------
-    axes
-        Where to draw.
-    trajectory
-        The motion.
-    name
-        State name, e.g. ``"phi"`` or ``"phi_dot"``.
-    **line
-        Properties of the line.
-
-    Raises
-    ------
-    InvalidInputError
-        For an unknown state.
+    ``axes``: where to draw. ``trajectory``: the motion. ``name``: state name, e.g. ``"phi"`` or
+    ``"phi_dot"``. ``**line``: properties of the line. Raises InvalidInputError for an unknown
+    state.
     """
     values, label = axis(trajectory, name)
     axes.plot(trajectory.t, values, **line)
@@ -137,19 +125,9 @@ def motion_figure(
 ) -> MotionFigure:
     """Return a figure of motions: a row for each coordinate and each input, over time.
 
-    Parameters
-    ----------
-    trajectories
-        Labels to motions of one mechanism.
-    until
-        Right end of the time axis, s; the longest motion's by default.
-    title
-        Above the first row.
-
-    Raises
-    ------
-    InvalidInputError
-        When there is nothing to draw.
+    ``trajectories``: labels to motions of one mechanism. ``until``: right end of the time axis, s;
+    the longest motion's by default. ``title``: above the first row. Raises InvalidInputError when
+    there is nothing to draw.
 
     Examples
     --------

@@ -418,14 +418,7 @@ def kernel_source(program: LoopGraph, *, header: str) -> str:
     """Return the source of a module with one function ``rollout``.
 
     It and ``etd_integrate`` do the lanes from one number to another, whole groups of them: threads
-    share a batch.
-
-    Parameters
-    ----------
-    program
-        The closed loop.
-    header
-        Text for the module's docstring.
+    share a batch. ``program``: the closed loop. ``header``: text for the module's docstring.
     """
     w = _Writer(program)
     sampling = ""

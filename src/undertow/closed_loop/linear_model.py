@@ -120,18 +120,9 @@ class Prepared(NamedTuple):
 class TerminalLinearModel:
     """The linear ends of all closed loops of one mechanism and objective.
 
-    Parameters
-    ----------
-    mechanism, objective
-        The closed loop's.
-    ensemble
-        Plants that the law of ``mechanism`` acts on, instead of it.
-
-    Attributes
-    ----------
-    stage
-        Second-order model of the stage cost; ``None`` where it has none, and then only
-        stability can be read off.
+    ``mechanism``, ``objective``: the closed loop's. ``ensemble``: plants that the law of
+    ``mechanism`` acts on, instead of it. ``stage``: second-order model of the stage cost; ``None``
+    where it has none, and then only stability can be read off.
     """
 
     def __init__(
@@ -208,17 +199,10 @@ class TerminalLinearModel:
     ) -> None:
         """Linearise closed loops and integrate what their linear ends need.
 
-        Parameters
-        ----------
-        lanes
-            Law vectors, (C, S, 2mn + 2m + 1), see :class:`undertow.law.LawLayout`, of each of S
-            surfaces, of which the last counts.
-        gains
-            k_i at the target, (C, m), where that is not η_i.
-        into
-            What is filled, see :meth:`buffers`.
-        member
-            Which plant of the ensemble each lane has, (C,).
+        ``lanes``: law vectors, (C, S, 2mn + 2m + 1), see :class:`undertow.law.LawLayout`, of each
+        of S surfaces, of which the last counts. ``gains``: k_i at the target, (C, m), where that is
+        not η_i. ``into``: what is filled, see :meth:`buffers`. ``member``: which plant of the
+        ensemble each lane has, (C,).
         """
         stage = self._weights
         _close(

@@ -274,7 +274,7 @@ class ClosedLoop:
     @cached_property
     def linear_end(self) -> TerminalLinearModel | None:
         """The linear model of this loop at the target, where it has one."""
-        if self.zoh_steps or self.reaching.switching == "sign" or self.plant is not None:
+        if self.zoh_steps or not self.reaching.has_layer or self.plant is not None:
             return None
         if not (has_linear_model(self.mechanism) and has_linear_model(self.truth)):
             return None
@@ -543,7 +543,7 @@ class ClosedLoop:
 
     def _check_gains(self, lanes: FloatArray, live: FloatArray, stable_only: bool) -> None:
         """Refuse gains (13) that this step cannot follow, or switch their lanes off."""
-        if not any(self.mechanism.disturbance_bounds) or self.reaching.switching == "sign":
+        if not (self.reaching.has_layer and any(self.mechanism.disturbance_bounds)):
             return
         layout = LawLayout(self.mechanism.n, self.mechanism.m)
         flat = lanes.reshape(-1, lanes.shape[-1])
@@ -670,7 +670,7 @@ class ClosedLoop:
     @property
     def adapts(self) -> bool:
         """Whether motions are integrated to a tolerance where that is asked for."""
-        return self.rtol > 0 and self.reaching.switching != "sign" and self.ensemble is None
+        return self.rtol > 0 and self.reaching.has_layer and self.ensemble is None
 
     @checked
     def simulate(

@@ -28,14 +28,9 @@ Kernel = Callable[..., None]
 def shared(kernel: Kernel, threads: int, lanes: int, steps: int) -> Kernel:
     """Return a kernel that so many threads share, fewer or one where more would not pay.
 
-    Parameters
-    ----------
-    kernel
-        Called with the first lane, the one behind the last, and more.
-    threads
-        The most threads.
-    lanes, steps
-        What it will be called for: rollouts, whole groups of lanes, and their length.
+    ``kernel``: called with the first lane, the one behind the last, and more. ``threads``: the most
+    threads. ``lanes``, ``steps``: what it will be called for: rollouts, whole groups of lanes, and
+    their length.
     """
     threads = min(threads, lanes // BLOCK, lanes * steps // WORTH)
     return kernel if threads <= 1 else partial(_in_threads, kernel, threads)

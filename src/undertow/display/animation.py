@@ -230,11 +230,6 @@ class Picture:
 
     The window holds what turning each angle, and moving each slide along its travel, can reach;
     it follows what leaves it.
-
-    Parameters
-    ----------
-    mechanism
-        What is drawn.
     """
 
     def __init__(self, mechanism: Mechanism) -> None:

@@ -194,17 +194,8 @@ class BalancingTask:
 class Lanes:
     """Ideal plants, many at once: integrated in blocks by one compiled call.
 
-    Parameters
-    ----------
-    task
-        Whose plants.
-    count
-        How many, N.
-
-    Attributes
-    ----------
-    u
-        Inputs to be held during the next step, (m, N), in their units.
+    ``task``: whose plants. ``count``: how many, N. ``u``: inputs to be held during the next step,
+    (m, N), in their units.
     """
 
     def __init__(self, task: BalancingTask, count: int) -> None:

@@ -68,10 +68,7 @@ def s_function(controller: EmbeddedController) -> dict[str, bytes]:
 def ros2_package(controller: EmbeddedController) -> dict[str, bytes]:
     """Return a ROS 2 package with the controller, in the folder ``undertow_<name>``.
 
-    Raises
-    ------
-    InvalidInputError
-        When the period is not that of a whole number of updates in a second.
+    Raises InvalidInputError when the period is not that of a whole number of updates in a second.
     """
     mechanism = controller.mechanism
     rate = 1 / controller.period

@@ -246,12 +246,8 @@ class Unit:
     def build(self, compiler: str = "gcc") -> bytes:
         """Return the unit: description, sources, and a library for this platform.
 
-        Raises
-        ------
-        MissingExtraError
-            When there is no such compiler, or FMI has no name for this platform.
-        ArtefactError
-            When the C does not compile.
+        Raises MissingExtraError when there is no such compiler, or FMI has no name for this
+        platform; ArtefactError when the C does not compile.
         """
         tuple_, ending = platform_tuple()
         sources = self.sources()

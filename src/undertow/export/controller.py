@@ -131,7 +131,7 @@ class EmbeddedController:
             layer = law.reaching.vector(self.mechanism.m)[self.mechanism.m :]
             gains = law(0.0, np.zeros(2 * self.mechanism.n)).gains
             fast = self.period * gains >= 2 * layer
-            if law.reaching.switching != "sign" and fast.any():
+            if law.reaching.has_layer and fast.any():
                 raise InvalidInputError(
                     "period of the exported loop",
                     value=f"{self.period:g} s",

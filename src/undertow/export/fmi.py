@@ -158,16 +158,10 @@ def fmi_units(
 ) -> dict[str, bytes]:
     """Return ``<name>_controller.fmu`` and ``<name>_plant.fmu``, built here: names to contents.
 
-    ``start`` is where the plant starts, (2n,), by default the mechanism's usual start.
-
-    Raises
-    ------
-    MissingExtraError
-        When there is no such compiler, or FMI has no name for this platform.
-    InvalidInputError
-        When two variables would have one name.
-    ArtefactError
-        When the C does not compile.
+    ``start`` is where the plant starts, (2n,), by default the mechanism's usual start. Raises
+    MissingExtraError when there is no such compiler, or FMI has no name for this platform;
+    InvalidInputError when two variables would have one name; ArtefactError when the C does not
+    compile.
     """
     units = (controller_unit(controller), plant_unit(controller, start))
     return {f"{unit.name}.fmu": unit.build(compiler) for unit in units}

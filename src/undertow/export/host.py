@@ -37,10 +37,7 @@ NEAREST = {"double": 0.0, "float": 1e-4}
 def tool(name: str) -> str:
     """Return the path of a program.
 
-    Raises
-    ------
-    MissingExtraError
-        When it is not installed.
+    Raises MissingExtraError when it is not installed.
     """
     path = shutil.which(name)
     if path is None:
@@ -63,12 +60,8 @@ def compile_c(
 ) -> Path:
     """Compile files of a folder, there, into a program or a library.
 
-    Raises
-    ------
-    MissingExtraError
-        When there is no such compiler.
-    ArtefactError
-        When the C does not compile, with the compiler's first complaint.
+    Raises MissingExtraError when there is no such compiler; ArtefactError when the C does not
+    compile, with the compiler's first complaint.
     """
     done = _run(tool(compiler), *FLAGS, *sources, "-o", program, *more, "-lm", cwd=folder)
     if done.returncode != 0:
@@ -130,12 +123,8 @@ class Build:
 
     The folder has its files, or they are written there; the compiler takes GCC's options.
 
-    Raises
-    ------
-    MissingExtraError
-        When there is no such compiler.
-    ArtefactError
-        When the C does not compile, with the compiler's first complaint.
+    Raises MissingExtraError when there is no such compiler; ArtefactError when the C does not
+    compile, with the compiler's first complaint.
     """
 
     def __init__(self, controller: EmbeddedController, folder: Path, compiler: str = "gcc") -> None:

@@ -13,14 +13,7 @@ import numpy as np
 
 from undertow.base import InvalidInputError, check_fields, checked, one_of, require, require_extra
 from undertow.closed_loop import ClosedLoop
-from undertow.law import (
-    InnerLoop,
-    Plan,
-    ReachingLaw,
-    Surface,
-    check_surface,
-    feedback_at_target,
-)
+from undertow.law import InnerLoop, Plan, ReachingLaw, Surface, check_surface, feedback_at_target
 from undertow.models import FloatArray, Mechanism, linearise
 
 #: Frequencies at which disk margins are looked for: this many, and so far about the eigenvalues.

@@ -112,7 +112,6 @@ def controller_files(controller: EmbeddedController) -> dict[str, bytes]:
     plan = plan_text(controller, controller.plan, controller.number)
     code = _generated_parts(controller)
     used = "\n".join(code.values())
-    sharp = controller.reaching.switching == "sign"
     limits = mechanism.input_limits
     slew = np.minimum(controller.slew_rates * controller.period, 2 * limits)
     values = shared | {
@@ -142,7 +141,9 @@ def controller_files(controller: EmbeddedController) -> dict[str, bytes]:
         "largest": literal(LARGEST, real),
         "tiny": literal(1e-12, real),
         "fabs": "fabsf" if real == "float" else "fabs",
-        "rate_check": "1" if sharp else "UT_PERIOD * out.gain[i] < 2 * row->layer[i]",
+        "rate_check": "UT_PERIOD * out.gain[i] < 2 * row->layer[i]"
+        if controller.reaching.has_layer
+        else "1",
         "helpers": helpers(used),
         **code,
     }

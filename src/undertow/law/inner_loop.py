@@ -197,11 +197,7 @@ def law_module(mechanism: Mechanism, switching: Switching, *, implicit: bool = F
         body = function_source(
             "law",
             tape,
-            {
-                "x": mechanism.x,
-                "lane": symbols.vector,
-                "parameters": mechanism.parameter_symbols,
-            },
+            {"x": mechanism.x, "lane": symbols.vector, "parameters": mechanism.parameter_symbols},
             {"demand": law.u, "s": law.s, "margin": [law.margin]},
         )
         return body, _CLIP

@@ -58,6 +58,7 @@ from undertow.models import (
     normal_name,
     number_of,
 )
+from undertow.symbolic import numba
 
 #: Damping of swinging modes in the reference of the unactuated coordinates, of critical.
 SWING_DAMPING = 0.5
@@ -113,22 +114,12 @@ class ReferenceMotion:
         return len(self.t) > 1
 
     def rows(self, t: ArrayLike) -> FloatArray:
-        """Return q_r, q̇_r and q̈_r at the times t, (N,) to (N, 3n).
-
-        q_r and q̇_r are cubic between rows, q̈_r is linear.
-        """
-        t = np.atleast_1d(np.asarray(t, dtype=float))
-        if not self.moves:
-            return np.repeat(np.hstack([self.q, self.v, self.a]), len(t), axis=0)
-        k = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2)
-        h = (self.t[k + 1] - self.t[k])[:, None]
-        z = np.clip((t - self.t[k])[:, None] / h, 0.0, 1.0)
-        q = _hermite(z, h, self.q[k], self.q[k + 1], self.v[k], self.v[k + 1])
-        v = _hermite(z, h, self.v[k], self.v[k + 1], self.a[k], self.a[k + 1])
-        a = (1 - z) * self.a[k] + z * self.a[k + 1]
-        outside = (t < self.t[0]) | (t > self.t[-1])
-        v[outside] = a[outside] = 0.0
-        return np.hstack([q, v, a])
+        """Return q_r, q̇_r and q̈_r at the times t, (N,) to (N, 3n); see :func:`reference_row`."""
+        times = np.atleast_1d(np.asarray(t, dtype=float))
+        rows = np.empty((len(times), 3 * self.q.shape[1]))
+        for at, row in zip(times, rows, strict=True):
+            reference_row(at, self.t, self.q, self.v, self.a, row)
+        return rows
 
     def position(self, t: float) -> tuple[float, ...]:
         """Return q_r(t), n numbers."""
@@ -145,14 +136,39 @@ class ReferenceMotion:
         return error_dynamics(mechanism, self.rows(t)[0])
 
 
-def _hermite(
-    z: FloatArray, h: FloatArray, a: FloatArray, b: FloatArray, da: FloatArray, db: FloatArray
-) -> FloatArray:
-    """Return the cubic from a to b with these slopes, at the part z of the interval h."""
-    rest = 1 - z
-    return np.asarray(
-        rest**2 * ((1 + 2 * z) * a + h * z * da) + z**2 * ((3 - 2 * z) * b - h * rest * db)
-    )
+@numba.njit(cache=True, error_model="numpy")
+def reference_row(
+    t: float, times: FloatArray, q: FloatArray, v: FloatArray, a: FloatArray, row: FloatArray
+) -> None:
+    """Write q_r, q̇_r and q̈_r of a :class:`ReferenceMotion` at the time t into a row, (3n,).
+
+    q_r and q̇_r are cubic between its rows, q̈_r is linear; before and after them it rests.
+    """
+    n, last = q.shape[1], times.shape[0] - 1
+    row[n:] = 0.0
+    if last == 0:
+        for i in range(n):
+            row[i] = q[0, i]
+        return
+    low, high = 0, last - 1
+    while low < high:
+        middle = (low + high + 1) // 2
+        if times[middle] <= t:
+            low = middle
+        else:
+            high = middle - 1
+    h = times[low + 1] - times[low]
+    z = min(1.0, max(0.0, (t - times[low]) / h))
+    y = 1.0 - z
+    for i in range(n):
+        row[i] = y * y * ((1.0 + 2.0 * z) * q[low, i] + h * z * v[low, i]) + z * z * (
+            (3.0 - 2.0 * z) * q[low + 1, i] - h * y * v[low + 1, i]
+        )
+        if times[0] <= t <= times[last]:
+            row[n + i] = y * y * ((1.0 + 2.0 * z) * v[low, i] + h * z * a[low, i]) + z * z * (
+                (3.0 - 2.0 * z) * v[low + 1, i] - h * y * a[low + 1, i]
+            )
+            row[2 * n + i] = y * a[low, i] + z * a[low + 1, i]
 
 
 # -- set-points ------------------------------------------------------------------------------
@@ -617,12 +633,10 @@ def _columns(path: Path, text: str) -> tuple[FloatArray, dict[str, FloatArray], 
     """Return times, the other columns of a file by name, SI units, and the units of those."""
     lines = csv.reader(io.StringIO(text))
     head = [cell.strip() for cell in next(lines, [])]
-    names: list[str] = []
-    factors: list[float] = []
-    units: list[str] = []
+    columns: list[tuple[str, float, str]] = []
     for cell in head:
         match = re.fullmatch(r"(\w+)\s*[(\[]\s*(\w+)\s*[)\]]", cell)
-        allowed = [u for u, (_, si) in FILE_UNITS.items() if (si == "s") == (not names)]
+        allowed = [u for u, (_, si) in FILE_UNITS.items() if (si == "s") == (not columns)]
         if match is None or match[2] not in allowed:
             raise InvalidInputError(
                 f"column '{cell}' of '{path}'",
@@ -630,10 +644,8 @@ def _columns(path: Path, text: str) -> tuple[FloatArray, dict[str, FloatArray], 
                 limit=f"a name with its unit, one of {', '.join(allowed)}",
                 remedy="Write the first line like: t (s), x (m), theta (deg)",
             )
-        factor, unit = FILE_UNITS[match[2]]
-        names.append(normal_name(match[1]))
-        factors.append(factor)
-        units.append(unit)
+        columns.append((normal_name(match[1]), *FILE_UNITS[match[2]]))
+    names = [name for name, _, _ in columns]
     if len(set(names)) < 2 or len(set(names)) < len(names):
         raise InvalidInputError(
             f"columns of '{path}'",
@@ -642,7 +654,7 @@ def _columns(path: Path, text: str) -> tuple[FloatArray, dict[str, FloatArray], 
         )
     rows = []
     for number, line in enumerate(lines, 2):
-        if not line or not "".join(line).strip():
+        if not "".join(line).strip():
             continue
         try:
             row = [float(cell) for cell in line]
@@ -655,9 +667,9 @@ def _columns(path: Path, text: str) -> tuple[FloatArray, dict[str, FloatArray], 
                 limit=f"{len(names)} finite numbers",
             )
         rows.append(row)
-    table = np.array(rows).reshape(-1, len(names)) * factors
-    columns = dict(zip(names[1:], table.T[1:], strict=True))
-    return table[:, 0], columns, dict(zip(names[1:], units[1:], strict=True))
+    table = np.array(rows).reshape(-1, len(names)) * [factor for _, factor, _ in columns]
+    units = {name: unit for name, _, unit in columns[1:]}
+    return table[:, 0], dict(zip(units, table.T[1:], strict=True)), units
 
 
 def _stable_inversion(
@@ -671,10 +683,8 @@ def _stable_inversion(
 ) -> None:
     """Fill in the unactuated columns of q, v and a, (N, n), with what the actuated ones leave.
 
-    Raises
-    ------
-    InvalidInputError
-        Where there is no bounded motion, or the reference is too fast to find it.
+    Raises InvalidInputError where there is no bounded motion, or the reference is too fast to find
+    it.
     """
     m = mechanism.m
     linear = linearise(mechanism)

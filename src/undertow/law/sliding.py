@@ -279,11 +279,7 @@ class _LawFunction:
         law = build_law_graph(
             mechanism.partition(tape), mechanism.x, symbols, switching, mechanism.disturbance_bounds
         )
-        inputs = [
-            *mechanism.x,
-            *symbols.vector,
-            *mechanism.parameter_symbols,
-        ]
+        inputs = [*mechanism.x, *symbols.vector, *mechanism.parameter_symbols]
         self.run = compile_numpy(tape, inputs, [*law.u, *law.s, *law.gains, law.margin])
 
     def __call__(
@@ -365,12 +361,7 @@ def gamma_determinant(X: FloatArray, surfaces: FloatArray) -> FloatArray:
 def singularity(mechanism: Mechanism, surfaces: FloatArray, q: ArrayLike) -> FloatArray:
     """Return det(α_a − α_u M_uu⁻¹ M_auᵀ) at positions q, broadcast over surface vectors.
 
-    Parameters
-    ----------
-    surfaces
-        Surface vectors, (…, 2mn).
-    q
-        Positions, (…, n); leading shapes broadcast.
+    ``surfaces``: surface vectors, (…, 2mn). ``q``: positions, (…, n); leading shapes broadcast.
     """
     return gamma_determinant(coupling(mechanism, q), surfaces)
 

@@ -344,6 +344,11 @@ class ReachingLaw:
             remedy = "The paper uses η = 20 and a layer of 0.1"
             positive(f"reaching law {name}", getattr(self, name), remedy)
 
+    @property
+    def has_layer(self) -> bool:
+        """Whether the law is continuous, with a boundary layer: all but ``"sign"``."""
+        return self.switching != "sign"
+
     @checked
     def vector(self, m: int) -> FloatArray:
         """Return (η_1 … η_m, ε_1 … ε_m)."""
@@ -375,7 +380,7 @@ class ReachingLaw:
         """
         eta, layer = self.per_surface(m)
         longest = float(np.min(2 * layer / eta))
-        if self.switching != "sign" and not period < longest:
+        if self.has_layer and not period < longest:
             raise InvalidInputError(
                 name,
                 value=f"{period:g} s",

@@ -1,4 +1,8 @@
-"""The library of mechanisms: one file each, parameters as data, sources cited."""
+"""The library of mechanisms: one file each, parameters as data, sources cited.
+
+Each is a function of the values of its parameters, by name and in SI units; an unknown name, and a
+value outside its bounds, raises InvalidInputError.
+"""
 
 from collections.abc import Callable
 

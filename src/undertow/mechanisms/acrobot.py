@@ -19,22 +19,9 @@ DRAKE = "Drake, examples/acrobot (Russ Tedrake and the Drake Development Team)"
 def acrobot(**values: float) -> Mechanism:
     """Return the Acrobot at its top position.
 
-    Parameters
-    ----------
-    **values
-        Parameter values to replace, SI units:
-        ``m_1, m_2, l_1, a_1, a_2, J_1, J_2, b_1, b_2, g``.
-
-    Returns
-    -------
-    Mechanism
-        Coordinates (q_2, q_1), rad, the elbow first; one input, the elbow torque, limited to
-        ±30 N m.
-
-    Raises
-    ------
-    InvalidInputError
-        For an unknown parameter or a value outside its bounds.
+    Coordinates (q_2, q_1), rad, the elbow first; one input, the elbow torque, limited to ±30 N m.
+    Parameters that ``values`` replace, SI units: ``m_1, m_2, l_1, a_1, a_2, J_1, J_2, b_1, b_2,
+    g``.
     """
     parameters = (
         Parameter("m_1", 1.0, "kg", "mass of link 1", 0, math.inf, SPONG),

@@ -23,20 +23,8 @@ HAUSER = (
 def ball_and_beam(**values: float) -> Mechanism:
     """Return the ball and beam.
 
-    Parameters
-    ----------
-    **values
-        Parameter values to replace, SI units: ``m_b, R_b, J, J_b, b_t, b_r, g``.
-
-    Returns
-    -------
-    Mechanism
-        Coordinates (θ, r), rad and m; one input, the torque on the beam, limited to ±0.5 N m.
-
-    Raises
-    ------
-    InvalidInputError
-        For an unknown parameter or a value outside its bounds.
+    Coordinates (θ, r), rad and m; one input, the torque on the beam, limited to ±0.5 N m.
+    Parameters that ``values`` replace, SI units: ``m_b, R_b, J, J_b, b_t, b_r, g``.
     """
     parameters = (
         Parameter("m_b", 0.05, "kg", "mass of the ball", 0, math.inf, HAUSER),

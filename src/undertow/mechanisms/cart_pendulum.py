@@ -19,20 +19,8 @@ CTMS = "University of Michigan, Control Tutorials for MATLAB and Simulink, Inver
 def cart_pendulum(**values: float) -> Mechanism:
     """Return the cart pendulum of the Control Tutorials.
 
-    Parameters
-    ----------
-    **values
-        Parameter values to replace, SI units: ``m_c, m_p, l, J_p, b_c, b_p, g``.
-
-    Returns
-    -------
-    Mechanism
-        Coordinates (x, φ), m and rad; one input, the force on the cart, limited to ±20 N.
-
-    Raises
-    ------
-    InvalidInputError
-        For an unknown parameter or a value outside its bounds.
+    Coordinates (x, φ), m and rad; one input, the force on the cart, limited to ±20 N. Parameters
+    that ``values`` replace, SI units: ``m_c, m_p, l, J_p, b_c, b_p, g``.
     """
     parameters = (
         Parameter("m_c", 0.5, "kg", "mass of the cart", 0, math.inf, CTMS),

@@ -19,22 +19,9 @@ GRAICHEN = (
 def double_pendulum_on_a_cart(**values: float) -> Mechanism:
     """Return the double pendulum on a cart.
 
-    Parameters
-    ----------
-    **values
-        Parameter values to replace, SI units:
-        ``m_c, m_1, m_2, l_1, a_1, a_2, J_1, J_2, b_c, b_1, b_2, g``.
-
-    Returns
-    -------
-    Mechanism
-        Coordinates (x, φ_1, φ_2), m and rad; one input, the force on the cart, limited to
-        ±40 N.
-
-    Raises
-    ------
-    InvalidInputError
-        For an unknown parameter or a value outside its bounds.
+    Coordinates (x, φ_1, φ_2), m and rad; one input, the force on the cart, limited to ±40 N.
+    Parameters that ``values`` replace, SI units: ``m_c, m_1, m_2, l_1, a_1, a_2, J_1, J_2, b_c,
+    b_1, b_2, g``.
     """
     parameters = (
         Parameter("m_c", 1.0, "kg", "mass of the cart", 0, math.inf, "chosen"),

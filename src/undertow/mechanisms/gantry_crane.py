@@ -26,21 +26,9 @@ FANG = (
 def gantry_crane(**values: float) -> Mechanism:
     """Return the gantry crane.
 
-    Parameters
-    ----------
-    **values
-        Parameter values to replace, SI units: ``m_r, m_c, m_p, l, J_p, b_x, b_y, b_p, g``.
-
-    Returns
-    -------
-    Mechanism
-        Coordinates (x, y, θ_x, θ_y), m and rad; two inputs, the forces on bridge and trolley,
-        limited to ±30 N and ±10 N.  The target is the load hanging at rest at x = y = 0.
-
-    Raises
-    ------
-    InvalidInputError
-        For an unknown parameter or a value outside its bounds.
+    Coordinates (x, y, θ_x, θ_y), m and rad; two inputs, the forces on bridge and trolley, limited
+    to ±30 N and ±10 N. The target is the load hanging at rest at x = y = 0. Parameters that
+    ``values`` replace, SI units: ``m_r, m_c, m_p, l, J_p, b_x, b_y, b_p, g``.
     """
     parameters = (
         Parameter("m_r", 6.4, "kg", "mass of the bridge", 0, math.inf, FANG),

@@ -26,23 +26,13 @@ _PLACE = re.compile(r"([^=]+)=([-+]?[\d.]+(?:[eE][-+]?\d+)?)(deg|rad|m)")
 def named(name: str) -> Mechanism:
     """Return a mechanism by its name in the library, or one's own from a file.
 
-    Parameters
-    ----------
-    name
-        A name of the library; ``FILE.py:NAME``, which runs the file; or ``FILE.urdf`` or
-        ``FILE.xml``, which are data.  Behind those ``:JOINT,JOINT`` names the actuated joints
-        where the file does not say which they are, ``:-JOINT`` freezes one; ``@upright``,
-        ``@hanging``, ``@nearest`` or ``@JOINT=180deg`` says which equilibrium is the target, see
-        :func:`~undertow.models.importers.at_equilibrium`.
-
-    Raises
-    ------
-    InvalidInputError
-        For an unknown name, and for a file of another format.
-    ModelError
-        When the file describes no such mechanism.
-    ArtefactError
-        When the file cannot be read or fails.
+    ``name``: a name of the library; ``FILE.py:NAME``, which runs the file; or ``FILE.urdf`` or
+    ``FILE.xml``, which are data.  Behind those ``:JOINT,JOINT`` names the actuated joints where the
+    file does not say which they are, ``:-JOINT`` freezes one; ``@upright``, ``@hanging``,
+    ``@nearest`` or ``@JOINT=180deg`` says which equilibrium is the target, see
+    :func:`~undertow.models.importers.at_equilibrium`. Raises InvalidInputError for an unknown name,
+    and for a file of another format; ModelError when the file describes no such mechanism;
+    ArtefactError when the file cannot be read or fails.
     """
     if in_a_file(name):
         return mechanism_from_file(name)
@@ -63,10 +53,7 @@ def named(name: str) -> Mechanism:
 def tree_named(name: str) -> Tree | None:
     """Return the bodies and joints that a name means; ``None`` where it is not such a file.
 
-    Raises
-    ------
-    InvalidInputError, ModelError, ArtefactError
-        As for :func:`named`.
+    Raises InvalidInputError, ModelError or ArtefactError as for :func:`named`.
     """
     data = DataName.of(name)
     if in_a_file(name) or data is None:
@@ -77,10 +64,7 @@ def tree_named(name: str) -> Tree | None:
 def origin(name: str) -> dict[str, float]:
     """Where the target of a mechanism from a URDF or MJCF file is, in the file's coordinates.
 
-    Raises
-    ------
-    InvalidInputError, ModelError, ArtefactError
-        As for :func:`named`.
+    Raises InvalidInputError, ModelError or ArtefactError as for :func:`named`.
     """
     data = DataName.of(name)
     if data is None:

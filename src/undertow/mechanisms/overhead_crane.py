@@ -23,21 +23,9 @@ FANG = (
 def overhead_crane(**values: float) -> Mechanism:
     """Return the overhead crane.
 
-    Parameters
-    ----------
-    **values
-        Parameter values to replace, SI units: ``m_c, m_p, l, J_p, b_c, b_p, g``.
-
-    Returns
-    -------
-    Mechanism
-        Coordinates (x, θ), m and rad; one input, the force on the trolley, limited to ±10 N.
-        The target is the trolley at rest at x = 0 with the load hanging.
-
-    Raises
-    ------
-    InvalidInputError
-        For an unknown parameter or a value outside its bounds.
+    Coordinates (x, θ), m and rad; one input, the force on the trolley, limited to ±10 N. The target
+    is the trolley at rest at x = 0 with the load hanging. Parameters that ``values`` replace, SI
+    units: ``m_c, m_p, l, J_p, b_c, b_p, g``.
     """
     parameters = (
         Parameter("m_c", 1.06, "kg", "mass of the trolley", 0, math.inf, FANG),

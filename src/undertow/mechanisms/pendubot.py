@@ -19,21 +19,8 @@ PILCO = (
 def pendubot(**values: float) -> Mechanism:
     """Return the Pendubot at its top position.
 
-    Parameters
-    ----------
-    **values
-        Parameter values to replace, SI units:
-        ``m_1, m_2, l_1, a_1, a_2, J_1, J_2, b_1, b_2, g``.
-
-    Returns
-    -------
-    Mechanism
-        Coordinates (q_1, q_2), rad; one input, the shoulder torque, limited to ±3.5 N m.
-
-    Raises
-    ------
-    InvalidInputError
-        For an unknown parameter or a value outside its bounds.
+    Coordinates (q_1, q_2), rad; one input, the shoulder torque, limited to ±3.5 N m. Parameters
+    that ``values`` replace, SI units: ``m_1, m_2, l_1, a_1, a_2, J_1, J_2, b_1, b_2, g``.
     """
     rod = "uniform rod"
     parameters = (

@@ -31,22 +31,9 @@ MOTOR = DCMotor(
 def reaction_wheel_pendulum(**values: float) -> Mechanism:
     """Return the reaction-wheel pendulum at its top position, driven by its motor's voltage.
 
-    Parameters
-    ----------
-    **values
-        Parameter values to replace, SI units: ``m_p, m_r, l_p, l_r, J_p, J_r, b_p, b_r, g`` and
-        the motor's ``torque_k_t, torque_R``, …
-
-    Returns
-    -------
-    Mechanism
-        Coordinates (ψ, φ), rad; one input, the voltage, limited to ±10 V: 0.023 N m, enough
-        to hold a lean of 3.7°.
-
-    Raises
-    ------
-    InvalidInputError
-        For an unknown parameter or a value outside its bounds.
+    Coordinates (ψ, φ), rad; one input, the voltage, limited to ±10 V: 0.023 N m, enough to hold a
+    lean of 3.7°. Parameters that ``values`` replace, SI units: ``m_p, m_r, l_p, l_r, J_p, J_r, b_p,
+    b_r, g`` and the motor's ``torque_k_t, torque_R``, …
     """
     parameters = (
         Parameter("m_p", 0.2164, "kg", "mass of the pendulum", 0, math.inf, BOOK),

@@ -23,21 +23,9 @@ RTAC = (
 def tora(**values: float) -> Mechanism:
     """Return the TORA of the benchmark.
 
-    Parameters
-    ----------
-    **values
-        Parameter values to replace, SI units: ``m_c, m_p, J_p, e, k, b_c, b_p``.
-
-    Returns
-    -------
-    Mechanism
-        Coordinates (θ, x), rad and m; one input, the torque on the proof mass, limited to
-        ±0.1 N m; the cart's stroke is ±0.025 m.
-
-    Raises
-    ------
-    InvalidInputError
-        For an unknown parameter or a value outside its bounds.
+    Coordinates (θ, x), rad and m; one input, the torque on the proof mass, limited to ±0.1 N m; the
+    cart's stroke is ±0.025 m. Parameters that ``values`` replace, SI units: ``m_c, m_p, J_p, e, k,
+    b_c, b_p``.
     """
     parameters = (
         Parameter("m_c", 1.3608, "kg", "mass of the cart", 0, math.inf, RTAC),

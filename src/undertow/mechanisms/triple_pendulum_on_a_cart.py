@@ -19,22 +19,9 @@ GLUECK = (
 def triple_pendulum_on_a_cart(**values: float) -> Mechanism:
     """Return the triple pendulum on a cart.
 
-    Parameters
-    ----------
-    **values
-        Parameter values to replace, SI units: ``m_c, m_1, m_2, m_3, l_1, l_2, a_1, a_2, a_3,
-        J_1, J_2, J_3, b_c, b_1, b_2, b_3, g``.
-
-    Returns
-    -------
-    Mechanism
-        Coordinates (x, φ_1, φ_2, φ_3), m and rad; one input, the force on the cart, limited
-        to ±100 N.
-
-    Raises
-    ------
-    InvalidInputError
-        For an unknown parameter or a value outside its bounds.
+    Coordinates (x, φ_1, φ_2, φ_3), m and rad; one input, the force on the cart, limited to ±100 N.
+    Parameters that ``values`` replace, SI units: ``m_c, m_1, m_2, m_3, l_1, l_2, a_1, a_2, a_3,
+    J_1, J_2, J_3, b_c, b_1, b_2, b_3, g``.
     """
     inf = math.inf
     parameters = (

@@ -16,22 +16,9 @@ from undertow.models import Input, Mechanism, Parameter
 def two_motor_three_link(**values: float) -> Mechanism:
     """Return the three-link robot with a passive first joint.
 
-    Parameters
-    ----------
-    **values
-        Parameter values to replace, SI units:
-        ``m_1, m_2, m_3, l_1, l_2, a_1, a_2, a_3, J_1, J_2, J_3, b_1, b_2, b_3, g``.
-
-    Returns
-    -------
-    Mechanism
-        Coordinates (q_2, q_3, q_1), rad; two inputs, the torques at joints 2 and 3, limited
-        to ±30 N m and ±20 N m.  All numbers are chosen: uniform rods of 1 kg and 0.5 m.
-
-    Raises
-    ------
-    InvalidInputError
-        For an unknown parameter or a value outside its bounds.
+    Coordinates (q_2, q_3, q_1), rad; two inputs, the torques at joints 2 and 3, limited to ±30 N m
+    and ±20 N m. All numbers are chosen: uniform rods of 1 kg and 0.5 m. Parameters that ``values``
+    replace, SI units: ``m_1, m_2, m_3, l_1, l_2, a_1, a_2, a_3, J_1, J_2, J_3, b_1, b_2, b_3, g``.
     """
     inf = math.inf
     links = (1, 2, 3)

@@ -35,21 +35,9 @@ MOTORS = DCMotor(
 def wheeled_inverted_pendulum(**values: float) -> Mechanism:
     """Return the NXTway-GS robot in its plane.
 
-    Parameters
-    ----------
-    **values
-        Parameter values to replace, SI units: ``m_b, m_w, R, l, J_b, J_w, g`` and the motors'
-        ``torque_k_t, torque_R``, …
-
-    Returns
-    -------
-    Mechanism
-        Coordinates (φ, ψ), rad; one input, the voltage of both motors, limited to ±8 V.
-
-    Raises
-    ------
-    InvalidInputError
-        For an unknown parameter or a value outside its bounds.
+    Coordinates (φ, ψ), rad; one input, the voltage of both motors, limited to ±8 V. Parameters that
+    ``values`` replace, SI units: ``m_b, m_w, R, l, J_b, J_w, g`` and the motors' ``torque_k_t,
+    torque_R``, …
     """
     parameters = (
         Parameter("m_b", 0.6, "kg", "mass of the body", 0, math.inf, NXT),

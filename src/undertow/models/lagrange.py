@@ -29,12 +29,8 @@ def derived(
     coordinates, the versions of Python and SymPy and this file's own text: a change of any of
     them derives afresh.
 
-    T and V are in J, Rayleigh's function D(q, q̇) in W; ``name`` is for messages.
-
-    Raises
-    ------
-    ModelError
-        When T is not a quadratic form in the velocities.
+    T and V are in J, Rayleigh's function D(q, q̇) in W; ``name`` is for messages. Raises ModelError
+    when T is not a quadratic form in the velocities.
     """
     key = content_key(*map(sp.srepr, (kinetic, potential, dissipation, [*q, *qd])))
     stored = recall("equations", key)
@@ -56,17 +52,11 @@ def derived(
 
 
 def quadratic_form(
-    name: str,
-    kinetic: sp.Expr,
-    qd: Sequence[sp.Symbol],
-    tidy: Callable[[sp.Expr], sp.Expr],
+    name: str, kinetic: sp.Expr, qd: Sequence[sp.Symbol], tidy: Callable[[sp.Expr], sp.Expr]
 ) -> sp.Matrix:
     """Return M = ∂²T/∂q̇², (n, n), of tidy entries, where T is ½ q̇ᵀ M(q) q̇.
 
-    Raises
-    ------
-    ModelError
-        When T is not a quadratic form in the velocities.
+    Raises ModelError when T is not a quadratic form in the velocities.
     """
     mass = sp.hessian(kinetic, list(qd)).applyfunc(tidy)
     at_rest = dict.fromkeys(qd, 0)

@@ -831,10 +831,7 @@ class Mechanism:
 def check_underactuated(name: str, n: int, m: int) -> None:
     """Refuse n coordinates under m inputs, unless 0 < m < n.
 
-    Raises
-    ------
-    ModelError
-        With both numbers.
+    Raises ModelError with both numbers.
     """
     if not 0 < m < n:
         raise ModelError(
@@ -856,13 +853,9 @@ def energies(
 ) -> tuple[sp.Expr, sp.Expr, sp.Expr]:
     """Check T, V and D before anything is derived from them, and return them as expressions.
 
-    Raises
-    ------
-    ModelError
-        For undeclared symbols, and for expressions without the derivatives that the equations of
-        motion need.
-    InvalidInputError
-        For coordinates, inputs or parameters of another type.
+    Raises ModelError for undeclared symbols, and for expressions without the derivatives that the
+    equations of motion need; InvalidInputError for coordinates, inputs or parameters of another
+    type.
     """
     check_parts(name, coordinates, inputs, parameters)
     data = vocabulary(parameters=parameters, time=False)

@@ -33,11 +33,7 @@ class Partition:
 
     @classmethod
     def of(
-        cls,
-        tape: Tape,
-        mass: Sequence[sp.Expr],
-        force: Sequence[sp.Expr],
-        gain: Sequence[sp.Expr],
+        cls, tape: Tape, mass: Sequence[sp.Expr], force: Sequence[sp.Expr], gain: Sequence[sp.Expr]
     ) -> Self:
         """Record the entries of M, f and B on a tape, row by row, and eliminate ``M_uu``."""
         n, m = len(force), math.isqrt(len(gain))

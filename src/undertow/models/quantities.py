@@ -226,10 +226,7 @@ class Parameter(_Named):
 def with_value(parameter: Parameter, value: float) -> Parameter:
     """Return a parameter with another value, SI units; nothing else is checked again.
 
-    Raises
-    ------
-    InvalidInputError
-        For a value that is not inside the interval.
+    Raises InvalidInputError for a value that is not inside the interval.
     """
     if not parameter.low < value < parameter.high:
         return replace(parameter, value=value)  # says what is wrong

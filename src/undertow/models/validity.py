@@ -60,12 +60,8 @@ _NEAR = 1e-9
 def check_names(owner: str, names: Sequence[str]) -> None:
     """Refuse names that clash with each other, with the time t, or with generated code.
 
-    Parameters
-    ----------
-    owner
-        Whose names.
-    names
-        As they were spelt: two that are the same to Python (in Unicode's form NFKC) clash.
+    ``owner``: whose names. ``names``: as they were spelt: two that are the same to Python (in
+    Unicode's form NFKC) clash.
     """
     every = [*names, TIME.name]
     normal = sorted(map(normal_name, names))
@@ -140,12 +136,8 @@ def check_parts(
 ) -> None:
     """Check that the parts are coordinates, inputs and parameters whose names do not clash.
 
-    Raises
-    ------
-    InvalidInputError
-        For a part of another kind, text for instance.
-    ModelError
-        For names that clash, see :func:`check_names`.
+    Raises InvalidInputError for a part of another kind, text for instance; ModelError for names
+    that clash, see :func:`check_names`.
     """
     for what, kind, parts in (
         ("coordinates", Coordinate, coordinates),

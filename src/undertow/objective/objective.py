@@ -265,12 +265,7 @@ def travel_box(mechanism: Mechanism, but: Container[str] = ()) -> tuple[Constrai
     """Return the ranges of travel that a mechanism declares, as constraints: 95 % of each side.
 
     The equations know no end stop; what is planned keeps clear of it all the same.  ``but`` names
-    coordinates to leave out.
-
-    Raises
-    ------
-    InvalidInputError
-        For a range that does not hold the target.
+    coordinates to leave out. Raises InvalidInputError for a range that does not hold the target.
 
     Examples
     --------
@@ -430,12 +425,8 @@ class Objective:
         """Refuse a terminal set beside which a range is nothing: all that is in it has arrived.
 
         A ball that is somewhat wider than one coordinate's travel is a matter of taste: the TORA's
-        cart moves 2.5 cm, and may come to rest within 5 cm, rad and their rates.
-
-        Raises
-        ------
-        InvalidInputError
-            With the range.
+        cart moves 2.5 cm, and may come to rest within 5 cm, rad and their rates. Raises
+        InvalidInputError with the range.
         """
         for c in constraints:
             box: Any = c.formula

@@ -13,11 +13,4 @@ from undertow.optimiser.optimiser import Optimiser, Planner
 from undertow.optimiser.proposal import Budget, Proposal
 from undertow.optimiser.search_space import DecisionVariables
 
-__all__ = [
-    "CMAES",
-    "Budget",
-    "DecisionVariables",
-    "Optimiser",
-    "Planner",
-    "Proposal",
-]
+__all__ = ["CMAES", "Budget", "DecisionVariables", "Optimiser", "Planner", "Proposal"]

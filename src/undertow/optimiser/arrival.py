@@ -50,19 +50,11 @@ class States(Protocol):
 class ArrivalSearch:
     """Looks for parameters whose motion arrives ever earlier.
 
-    Parameters
-    ----------
-    states
-        The closest states until T, s, for parameters (N, d): (N, k), infinite for a motion that
-        broke off before; and when that is, (N,).
-    admits
-        Whether parameters (N, d) whose motions arrive are admissible, (N,).
-    radius
-        ‖state‖₂ that counts as arrived.
-    without
-        Whether so many evaluations cannot be had any more.
-    shorter, fewest
-        T after an arrival, as a part of the one before; how many members remain at least.
+    ``states``: the closest states until T, s, for parameters (N, d): (N, k), infinite for a motion
+    that broke off before; and when that is, (N,). ``admits``: whether parameters (N, d) whose
+    motions arrive are admissible, (N,). ``radius``: ‖state‖₂ that counts as arrived. ``without``:
+    whether so many evaluations cannot be had any more. ``shorter``, ``fewest``: T after an arrival,
+    as a part of the one before; how many members remain at least.
     """
 
     states: States

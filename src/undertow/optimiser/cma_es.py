@@ -192,27 +192,12 @@ def minimise(
 ) -> int:
     """Run a search until its budget is spent, it has converged, or ``stop()`` says so.
 
-    Parameters
-    ----------
-    cost
-        (N, d) to (N,).
-    evaluations
-        Budget; the last generation that fits is the last.
-    tolerance
-        Converged when the spread of the distribution falls below it.
-    resolution
-        Converged when ``patience`` generations together improve the cost by less; 0: never.
-    relative
-        The same as a part of the best cost; whichever is larger counts.
-    patience
-        Generations.
-    below
-        Generations count for that from the first one on whose best costs less; ``None``: all do.
-
-    Returns
-    -------
-    int
-        Evaluations spent.
+    ``cost``: (N, d) to (N,). ``evaluations``: budget; the last generation that fits is the last.
+    ``tolerance``: converged when the spread of the distribution falls below it. ``resolution``:
+    converged when ``patience`` generations together improve the cost by less; 0: never.
+    ``relative``: the same as a part of the best cost; whichever is larger counts. ``patience``:
+    generations. ``below``: generations count for that from the first one on whose best costs less;
+    ``None``: all do. Returns the evaluations spent.
     """
     spent = 0
     bests = [search.best_f]

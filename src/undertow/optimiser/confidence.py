@@ -26,16 +26,9 @@ ALIKE = 0.01
 def confidence(minima: Sequence[float]) -> float | None:
     """Return how likely the best of some minima is within 1 % of the best of all.
 
-    Parameters
-    ----------
-    minima
-        Where searches from independent random starts ended, one cost each; those that found
-        nothing, ``inf``, are left out.
-
-    Returns
-    -------
-    float or None
-        0 where each ended elsewhere; ``None`` for fewer than two, which tell nothing.
+    ``minima``: where searches from independent random starts ended, one cost each; those that found
+    nothing, ``inf``, are left out. Returns 0 where each ended elsewhere; ``None`` for fewer than
+    two, which tell nothing.
     """
     ends = sorted(cost for cost in minima if math.isfinite(cost))
     if len(ends) < 2:

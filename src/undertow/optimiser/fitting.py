@@ -39,14 +39,8 @@ SWITCHING_THICK = (0.05, 0.3, 2.0)
 def fits(space: SearchSpace, anchor: Surface, x: FloatArray, qdd: FloatArray) -> FloatArray:
     """Return search coordinates (N, d) of surfaces that follow a piece of a motion.
 
-    Parameters
-    ----------
-    space
-        The coordinates, of one surface with its reaching law.
-    anchor
-        The first surface.
-    x, qdd
-        States (2n, K) and accelerations (n, K) along the piece, SI units.
+    ``space``: the coordinates, of one surface with its reaching law. ``anchor``: the first surface.
+    ``x``, ``qdd``: states (2n, K) and accelerations (n, K) along the piece, SI units.
     """
     pairs = itertools.product(RATES, DRAWN_TO)
     return np.array([next(_encoded(space, anchor, x, qdd, x, *pair, (THICK,))) for pair in pairs])
@@ -57,14 +51,9 @@ def switching_fits(
 ) -> FloatArray:
     """Return search coordinates (N, d) of surfaces that switch at some points of a motion.
 
-    Parameters
-    ----------
-    space, anchor
-        See :func:`fits`; without reaching laws of their own only the surfaces count.
-    x, qdd
-        States (2n, K) and accelerations (n, K) without input there, SI units.
-    along
-        States (2n, L) along the whole motion.
+    ``space``, ``anchor``: see :func:`fits`; without reaching laws of their own only the surfaces
+    count. ``x``, ``qdd``: states (2n, K) and accelerations (n, K) without input there, SI units.
+    ``along``: states (2n, L) along the whole motion.
     """
     pairs = itertools.product(SWITCHING_RATES, SWITCHING_DRAWN_TO)
     return np.vstack(

@@ -63,23 +63,13 @@ def refined(times: Sequence[float], period: float, end: float, step: float) -> t
 class Follower:
     """Looks for surfaces that follow a motion to its end.
 
-    Parameters
-    ----------
-    draw
-        Draws search coordinates of so many surfaces, (N, d), some of them near the last one (d,).
-    fit
-        Search coordinates (N, d) for states (2n, K) and accelerations (n, K) to be followed.
-    states
-        States (N, 2n) so long, s, after a state x, for search coordinates (N, d); infinite for a
-        motion that broke off.
-    exact
-        The same, integrated without the errors of a search.
-    arrival
-        Whose motions are followed, and found anew from where the surfaces lead.
-    period
-        The longest piece, s: one ends at each of its multiples.
-    step
-        Of which pieces are multiples, s.
+    ``draw``: draws search coordinates of so many surfaces, (N, d), some of them near the last one
+    (d,). ``fit``: search coordinates (N, d) for states (2n, K) and accelerations (n, K) to be
+    followed. ``states``: states (N, 2n) so long, s, after a state x, for search coordinates (N, d);
+    infinite for a motion that broke off. ``exact``: the same, integrated without the errors of a
+    search. ``arrival``: whose motions are followed, and found anew from where the surfaces lead.
+    ``period``: the longest piece, s: one ends at each of its multiples. ``step``: of which pieces
+    are multiples, s.
     """
 
     draw: Callable[[int, FloatArray | None], FloatArray]

@@ -104,16 +104,9 @@ class OpenLoopMotion:
 class EarliestArrival:
     """Looks for the inputs that bring a mechanism to ‖x‖₂ ≤ radius in the least time.
 
-    Parameters
-    ----------
-    mechanism
-        The model, every input limited.
-    radius
-        ν of the terminal set.
-    low, high
-        Bounds of the states at the nodes, (2n,); infinite where there are none.
-    late
-        Whether there is no time left for another linear program.
+    ``mechanism``: the model, every input limited. ``radius``: ν of the terminal set. ``low``,
+    ``high``: bounds of the states at the nodes, (2n,); infinite where there are none. ``late``:
+    whether there is no time left for another linear program.
     """
 
     mechanism: Mechanism

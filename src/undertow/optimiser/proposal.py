@@ -147,10 +147,7 @@ def _turned(mechanism: Mechanism, x: FloatArray) -> str:
 def check_held(loop: ClosedLoop) -> None:
     """Refuse a target that the inputs cannot hold: no start comes home to stay.
 
-    Raises
-    ------
-    InfeasibleError
-        With the input, what it would have to be there, and its limit.
+    Raises InfeasibleError with the input, what it would have to be there, and its limit.
     """
     held = np.abs(holding_input(loop.mechanism))
     for given, u, limit in zip(loop.mechanism.inputs, held, loop.input_limits, strict=True):
@@ -180,14 +177,8 @@ def motion_margins(
     except SingularSurfaceError as error:
         return (), str(error), error.remedy
     batch = loop.batch(x, plan, duration=horizon)
-    margins.append(
-        Margin(
-            "(37) along the motion: min det Γ(q)/det Γ(0)",
-            float(batch.singular[0]),
-            "",
-            "Start closer to the target",
-        )
-    )
+    what, least = "(37) along the motion: min det Γ(q)/det Γ(0)", float(batch.singular[0])
+    margins.append(Margin(what, least, "", "Start closer to the target"))
     if objective.hard_input:
         margins.append(
             Margin(
@@ -198,13 +189,9 @@ def motion_margins(
                 "actuator clip (hard_input=False)",
             )
         )
+    remedy = "Relax the constraint or start elsewhere"
     margins += [
-        Margin(
-            constraint.name,
-            float(value),
-            constraint.unit,
-            "Relax the constraint or start elsewhere",
-        )
+        Margin(constraint.name, float(value), constraint.unit, remedy)
         for constraint, value in zip(objective.constraints, batch.path[0], strict=True)
     ]
     event = Event(int(batch.event[0]))

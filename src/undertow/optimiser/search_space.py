@@ -80,14 +80,8 @@ class DecisionVariables:
 class SearchSpace:
     """Search coordinates z for plans of one closed loop.
 
-    Parameters
-    ----------
-    loop
-        The closed loop: its reaching law is the centre of the reaching coordinates.
-    anchor
-        First surface: sets the scale of each entry.
-    freedom
-        What may be chosen.
+    ``loop``: the closed loop: its reaching law is the centre of the reaching coordinates.
+    ``anchor``: first surface: sets the scale of each entry. ``freedom``: what may be chosen.
     """
 
     def __init__(self, loop: ClosedLoop, anchor: Surface, freedom: DecisionVariables) -> None:

@@ -43,12 +43,7 @@ AROUND, CLOSE, FEW = 100, (-3.0, -1.0), 16
 class SwitchingSurfaces:
     """Surfaces fitted to the switches of the earliest arrival.
 
-    Attributes
-    ----------
-    z
-        Their search coordinates, (N, d).
-    time
-        When that motion arrives, s.
+    ``z``: their search coordinates, (N, d). ``time``: when that motion arrives, s.
     """
 
     z: FloatArray

@@ -57,24 +57,11 @@ DOUBTED, GRAZES = 4, 0.01
 class Optimisation:
     """The state of one running optimisation: the best plan so far at any moment.
 
-    Parameters
-    ----------
-    optimiser
-        What is optimised, and how.
-    x
-        State, (2n,).
-    horizon
-        Longest prediction, s.
-    budget
-        What may be spent.
-    resolution
-        Differences in cost below this are not worth a search.
-    sequence
-        Number of the proposal: with the optimiser's seed it decides all randomness.
-    warm
-        Whether there is a plan in use.
-    unit
-        What costs are answered in, of those of the optimiser: a search for least time is one in s.
+    ``optimiser``: what is optimised, and how. ``x``: state, (2n,). ``horizon``: longest prediction,
+    s. ``budget``: what may be spent. ``resolution``: differences in cost below this are not worth a
+    search. ``sequence``: number of the proposal: with the optimiser's seed it decides all
+    randomness. ``warm``: whether there is a plan in use. ``unit``: what costs are answered in, of
+    those of the optimiser: a search for least time is one in s.
     """
 
     def __init__(

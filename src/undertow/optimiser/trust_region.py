@@ -26,21 +26,10 @@ STRETCHES = np.array([0.35, 0.7, 1.0, 1.4, 2.0, 3.0])
 class TrustRegion:
     """Minimise a smooth function of few coordinates, a batch at a time.
 
-    Parameters
-    ----------
-    mean
-        First guess, (d,).
-    radius
-        First spread of the samples around it.
-    population
-        Candidates per generation; the first one has as many as the model needs.
-    rng
-        Source of randomness: the same generator state gives the same search.
-
-    Raises
-    ------
-    InvalidInputError
-        For a mean that is not finite, or radius or population out of range.
+    ``mean``: first guess, (d,). ``radius``: first spread of the samples around it. ``population``:
+    candidates per generation; the first one has as many as the model needs. ``rng``: source of
+    randomness: the same generator state gives the same search. Raises InvalidInputError for a mean
+    that is not finite, or radius or population out of range.
     """
 
     def __init__(

@@ -14,15 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from undertow.base import (
-    InvalidInputError,
-    ReadOnly,
-    at_least,
-    between,
-    one_of,
-    positive,
-    require,
-)
+from undertow.base import InvalidInputError, ReadOnly, at_least, between, one_of, positive, require
 from undertow.mechanisms import rotary_pendulum
 from undertow.models import FloatArray, Mechanism, Parameter
 

@@ -52,10 +52,7 @@ class Measurement:
 def driver_errors(what: str, limit: str, remedy: str) -> Iterator[None]:
     """Turn what a driver raises, which may be anything, into one condition.
 
-    Raises
-    ------
-    ArtefactError
-        With the driver's own words, and where it raised.
+    Raises ArtefactError with the driver's own words, and where it raised.
     """
     try:
         yield
@@ -69,10 +66,7 @@ def driver_errors(what: str, limit: str, remedy: str) -> Iterator[None]:
 def copy_numbers(values: ArrayLike, place: FloatArray, what: str) -> None:
     """Copy what a rig or its user said into its place, (k,), whatever it is made of.
 
-    Raises
-    ------
-    InvalidInputError
-        When it is not k numbers.
+    Raises InvalidInputError when it is not k numbers.
     """
     if getattr(values, "shape", None) != place.shape and np.shape(values) != place.shape:
         raise InvalidInputError(
@@ -87,10 +81,7 @@ def copy_numbers(values: ArrayLike, place: FloatArray, what: str) -> None:
 def copied(measurement: Measurement, n: int) -> Measurement:
     """Return a copy that the rig cannot change any more, of n numbers each.
 
-    Raises
-    ------
-    InvalidInputError
-        When it is not n positions, and n velocities if any.
+    Raises InvalidInputError when it is not n positions, and n velocities if any.
     """
     q, v = np.empty(n), None if measurement.v is None else np.empty(n)
     copy_numbers(measurement.q, q, "measured q")
@@ -133,13 +124,7 @@ class Rig(Protocol):
 
 
 class RigWrapper:
-    """A rig before another one: what a subclass does not change is passed on.
-
-    Parameters
-    ----------
-    rig
-        The rig behind it.
-    """
+    """A rig before another one, ``rig``: what a subclass does not change is passed on."""
 
     def __init__(self, rig: Rig) -> None:
         self.rig, self.period = rig, rig.period
@@ -162,11 +147,6 @@ class Paced(RigWrapper):
 
     A simulated rig advances when it is written to, hardware by itself: here each
     :meth:`write` waits until the next reading is due.  After a late one the pace starts anew.
-
-    Parameters
-    ----------
-    rig
-        The driver.
 
     Examples
     --------

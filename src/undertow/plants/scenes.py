@@ -35,10 +35,7 @@ class Scene:
 def mujoco_scene(mechanism: Mechanism) -> Scene:
     """Return the MuJoCo scene of a mechanism of the library, with its present parameters.
 
-    Raises
-    ------
-    InvalidInputError
-        For a mechanism that is not of the library.
+    Raises InvalidInputError for a mechanism that is not of the library.
     """
     own = "Bring an MJCF file of your own: undertow.models.importers.from_mjcf"
     one_of("MuJoCo scene", mechanism.name, _SCENES, own)

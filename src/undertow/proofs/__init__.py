@@ -6,12 +6,7 @@ certificates; what ``search`` finds is trusted nowhere.  The admission gate
 """
 
 from undertow.base.verdict import Verdict
-from undertow.proofs.claims.certificate import (
-    Certificate,
-    StatedClaim,
-    Subject,
-    read_certificate,
-)
+from undertow.proofs.claims.certificate import Certificate, StatedClaim, Subject, read_certificate
 from undertow.proofs.claims.claim import Claim
 from undertow.proofs.claims.closed_loop import LoopClaim
 from undertow.proofs.claims.nonsingular import NonsingularClaim, nonsingular, singular_distance

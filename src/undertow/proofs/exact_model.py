@@ -24,10 +24,7 @@ from undertow.models.validity import require_smooth
 def exact_fraction(expression: sp.Expr) -> Fraction:
     """Return the exact value of a SymPy number: a Float counts as the binary number it is.
 
-    Raises
-    ------
-    InvalidInputError
-        For a number that is not rational.
+    Raises InvalidInputError for a number that is not rational.
     """
     if expression.is_Float:
         sign, mantissa, exponent, _ = expression._mpf_
@@ -59,10 +56,7 @@ def exact_expression(expression: sp.Expr) -> sp.Expr:
 def exact_mechanism(mechanism: Mechanism) -> Mechanism:
     """Return the mechanism with exact expressions; itself where they hold no floats.
 
-    Raises
-    ------
-    ModelError
-        For expressions that are not smooth, everywhere or at the target.
+    Raises ModelError for expressions that are not smooth, everywhere or at the target.
     """
     blocks = ("mass_matrix", "force", "input_matrix")
     values = {p.symbol: p.value for p in mechanism.parameters}

@@ -109,14 +109,14 @@ class _Case:
     @property
     def law(self) -> ReachingLaw:
         """Its reaching law."""
-        return self.loop.reaching if self.plan.reaching is None else self.plan.reaching[-1]
+        return self.plan.laws(self.loop.reaching)[-1]
 
     @property
     def why_not(self) -> str:
         """Why no terminal set is proved for this kind of loop, or nothing."""
         if self.loop.zoh_steps:
             return "terminal sets are proved for the continuous law, and this loop is sampled"
-        if self.law.switching == "sign":
+        if not self.law.has_layer:
             return "terminal sets need a boundary layer, and this law switches with sign(s)"
         return ""
 

@@ -26,17 +26,8 @@ Sampler = Callable[[np.random.Generator, int], FloatArray]
 def failure_bound(failures: int, trials: int, confidence: float = 0.999) -> float:
     """Return the one-sided Clopper-Pearson upper bound on a probability of failure.
 
-    Parameters
-    ----------
-    failures, trials
-        0 ≤ failures ≤ trials, trials ≥ 1.
-    confidence
-        In (0, 1).
-
-    Raises
-    ------
-    InvalidInputError
-        For numbers outside these ranges.
+    ``failures``, ``trials``: 0 ≤ failures ≤ trials, trials ≥ 1. ``confidence``: in (0, 1). Raises
+    InvalidInputError for numbers outside these ranges.
 
     Examples
     --------

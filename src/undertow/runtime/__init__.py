@@ -11,12 +11,7 @@ for bit, by :mod:`.replay`.
 
 from undertow.runtime.clock import Histogram, SimulatedClock, WallClock
 from undertow.runtime.controller import Controller, Inputs
-from undertow.runtime.controller_defaults import (
-    default_gate,
-    estimator_for,
-    for_rig,
-    reaching_for,
-)
+from undertow.runtime.controller_defaults import default_gate, estimator_for, for_rig, reaching_for
 from undertow.runtime.encoding import Columns
 from undertow.runtime.log import Log
 from undertow.runtime.log_files import column_units, to_mcap, to_parquet

@@ -22,6 +22,7 @@ from undertow.cascade import Admission, Cascade, CascadeState, Legs
 from undertow.cascade.swing_up import SwingUpAndCatch
 from undertow.estimators import Estimator
 from undertow.law import InnerLoop, ReferenceMotion
+from undertow.law.reference import reference_row
 from undertow.models import FloatArray, error_dynamics
 from undertow.optimiser import Proposal
 from undertow.plants import Measurement
@@ -35,7 +36,6 @@ from undertow.runtime.steps import (
     BEYOND_TRAVEL,
     all_finite,
     limit_output,
-    reference_row,
     relative_error,
     step_memory,
     step_module,

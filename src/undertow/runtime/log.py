@@ -325,10 +325,7 @@ def _refused(path: Path) -> Iterator[None]:
 def check_log(path: Path) -> None:
     """Make the folder of a log, and see that no other run and no other file is in its way.
 
-    Raises
-    ------
-    ArtefactError
-        When the log could not be made.
+    Raises ArtefactError when the log could not be made.
     """
     with _refused(path):
         if "\0" in str(path):

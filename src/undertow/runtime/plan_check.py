@@ -53,11 +53,7 @@ class PlanCheck:
         """Return the numbers of the law for each surface of a plan, (S, 2mn + 2m + 1).
 
         The same as :func:`undertow.runtime.slow_loop.law_vectors_of`, in a tenth of its time.
-
-        Raises
-        ------
-        ValueError
-            For a plan of another mechanism.
+        Raises ValueError for a plan of another mechanism.
         """
         layout, m = self._layout, self._m
         law_vectors = np.empty((len(plan.surfaces), layout.size))

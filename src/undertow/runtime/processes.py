@@ -92,14 +92,9 @@ def fork(
     ``ignores``: which of :data:`STOPPING` it ignores from the beginning, in a session of its own:
     Ctrl-C, Ctrl-Z and a lost connection reach every process of a terminal, and a supervisor that is
     stopped or ended with its controller keeps nothing. The others end it. A stop that is asked for
-    meanwhile reaches this process once the other has begun.
-
-    Raises
-    ------
-    InvalidInputError
-        On a system that cannot copy a process.
-    ResourceError
-        When the system has no process more, or no memory for it.
+    meanwhile reaches this process once the other has begun. Raises InvalidInputError on a system
+    that cannot copy a process; ResourceError when the system has no process more, or no memory for
+    it.
     """
     if not hasattr(os, "fork"):
         raise InvalidInputError(
@@ -153,10 +148,7 @@ def _begin(target: Callable[..., None], args: tuple[Any, ...], ignores: Collecti
 def pipe() -> tuple[Connection, Connection]:
     """Return the two ends of a pipe.
 
-    Raises
-    ------
-    ResourceError
-        When this process may have no more files open.
+    Raises ResourceError when this process may have no more files open.
     """
     try:
         return multiprocessing.get_context("fork").Pipe()
@@ -202,12 +194,8 @@ class Background(threading.Thread):
     :meth:`threading.Thread.start` waits without end for a thread that the system made but had
     no memory to begin with.
 
-    The process does not wait for ``target`` when it ends.
-
-    Raises
-    ------
-    ResourceError
-        When it does not begin.
+    The process does not wait for ``target`` when it ends. Raises ResourceError when it does not
+    begin.
     """
 
     def __init__(self, target: Callable[[], None], name: str) -> None:
@@ -247,12 +235,7 @@ def check_resources(*, processes: int, log: bool = False) -> None:
     """See that the system has what a run needs, before anything of a rig is touched.
 
     It will fork so many processes; what the disk of a log has free is
-    :func:`undertow.runtime.log.check_log`'s.
-
-    Raises
-    ------
-    ResourceError
-        When it has not.
+    :func:`undertow.runtime.log.check_log`'s. Raises ResourceError when it has not.
     """
     _check_memory(MEMORY + processes * MEMORY_EACH)
     _check_files(FILES + processes * FILES_EACH)
@@ -329,11 +312,8 @@ def _check_file_size() -> None:
 def resource_errors(what: str) -> Iterator[None]:
     """Say of what the system refuses for lack of something what it was for.
 
-    Raises
-    ------
-    ResourceError
-        In the place of a MemoryError, and of an OSError for lack of memory, processes,
-        descriptors or disk.
+    Raises ResourceError in the place of a MemoryError, and of an OSError for lack of memory,
+    processes, descriptors or disk.
     """
     try:
         yield

@@ -183,10 +183,7 @@ class GrowingLog:
 
     Each look opens the file to be read alone, and closes it again: who writes it waits for nothing.
 
-    Parameters
-    ----------
-    path
-        Its first file.
+    ``path``: its first file.
     """
 
     def __init__(self, path: Path) -> None:

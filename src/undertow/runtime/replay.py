@@ -23,14 +23,7 @@ from undertow.mechanisms.named import named
 from undertow.models import FloatArray, Mechanism
 from undertow.models.importers.python_file import in_a_file
 from undertow.runtime.controller import Controller, Inputs
-from undertow.runtime.encoding import (
-    TOLD,
-    Columns,
-    answer_from,
-    legs_from,
-    memory_from,
-    memory_to,
-)
+from undertow.runtime.encoding import TOLD, Columns, answer_from, legs_from, memory_from, memory_to
 from undertow.runtime.modes import Command
 from undertow.runtime.recipe import Recipe
 from undertow.runtime.recording import Recording, read_log
@@ -149,10 +142,7 @@ def recorded_recipe(
 ) -> tuple[Recipe, tuple[str, ...]]:
     """Return the recipe that a log carries, and what else is to be known of it, in sentences.
 
-    Raises
-    ------
-    ArtefactError
-        As for :func:`replay`.
+    Raises ArtefactError as for :func:`replay`.
     """
     path = recording.path
     if isinstance(mechanism, str):

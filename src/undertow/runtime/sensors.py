@@ -233,12 +233,7 @@ class SensorMonitor:
         and u, (m,), the input since then. What comes back has NaN for what is missing, is ``None``
         before the first sound reading, and is written over by the next call. Two numbers say what
         was found, a fault if above ``LAST_HARMLESS``, and at which sensor: :meth:`describe` says it
-        in words.
-
-        Raises
-        ------
-        InvalidInputError
-            When the rig does not give one number per coordinate.
+        in words. Raises InvalidInputError when the rig does not give one number per coordinate.
         """
         stamp, accepted = math.nan, self._accepted
         if measurement is not None:
@@ -272,10 +267,8 @@ class SensorMonitor:
     def worst(self, elapsed: float) -> str:
         """Return in words which sensor was missing most often; empty if none was.
 
-        Parameters
-        ----------
-        elapsed
-            Time since the watch started afresh, s: of it no more than a window is looked at.
+        ``elapsed``: time since the watch started afresh, s: of it no more than a window is looked
+        at.
         """
         where, looked_at = int(self._shares.argmax()), -math.expm1(-elapsed / self._window)
         share = min(1.0, self._shares[where] / looked_at)

@@ -45,14 +45,9 @@ def rig_named(word: str, recipe: Recipe, *, supervised: bool) -> Rig | None:
 
     The word is ``ideal``, ``realistic``, ``mujoco``, ``FILE.xml`` or ``FILE.py:NAME``; in MuJoCo a
     mechanism of an MJCF file moves as that file, one of the library as its own scene.
-    ``supervised``: a process of its own holds the rig.
-
-    Raises
-    ------
-    InvalidInputError
-        For another word, and for a driver of another period than the fast loop's.
-    ArtefactError
-        For a driver that cannot be made, read and closed.
+    ``supervised``: a process of its own holds the rig. Raises InvalidInputError for another word,
+    and for a driver of another period than the fast loop's; ArtefactError for a driver that cannot
+    be made, read and closed.
     """
 
     def held(make: Callable[[], Rig]) -> Rig:

@@ -124,10 +124,8 @@ def is_answer(said: object) -> TypeGuard[Answer]:
 def law_vectors_of(cascade: Cascade, memory: CascadeState) -> FloatArray:
     """Return the numbers of the compiled law for each surface of its plan, (S, 2mn + 2m + 1).
 
-    Raises
-    ------
-    UndertowError
-        For a plan that does not fit the mechanism, or is singular at the target.
+    Raises UndertowError for for a plan that does not fit the mechanism, or is singular at the
+    target.
     """
     plan, believed = memory.plan, cascade.believed(memory)
     pairs = zip(plan.surfaces, plan.laws(cascade.reaching), strict=True)

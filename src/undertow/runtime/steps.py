@@ -190,42 +190,6 @@ def accept_estimate(
     return True
 
 
-@numba.njit(cache=True, error_model="numpy")
-def reference_row(
-    t: float, times: FloatArray, q: FloatArray, v: FloatArray, a: FloatArray, row: FloatArray
-) -> None:
-    """Write q_r, q̇_r and q̈_r at the time t into a row, (3n,), as :class:`ReferenceMotion` has them.
-
-    Of the motion there are ``times``, (N,), s, and ``q``, ``v``, ``a``, (N, n) each; one row is a
-    set-point.
-    """
-    n, last = q.shape[1], times.shape[0] - 1
-    row[n:] = 0.0
-    if last == 0:
-        for i in range(n):
-            row[i] = q[0, i]
-        return
-    low, high = 0, last - 1
-    while low < high:
-        middle = (low + high + 1) // 2
-        if times[middle] <= t:
-            low = middle
-        else:
-            high = middle - 1
-    h = times[low + 1] - times[low]
-    z = min(1.0, max(0.0, (t - times[low]) / h))
-    y = 1.0 - z
-    for i in range(n):
-        row[i] = y * y * ((1.0 + 2.0 * z) * q[low, i] + h * z * v[low, i]) + z * z * (
-            (3.0 - 2.0 * z) * q[low + 1, i] - h * y * v[low + 1, i]
-        )
-        if times[0] <= t <= times[last]:
-            row[n + i] = y * y * ((1.0 + 2.0 * z) * v[low, i] + h * z * a[low, i]) + z * z * (
-                (3.0 - 2.0 * z) * v[low + 1, i] - h * y * a[low + 1, i]
-            )
-            row[2 * n + i] = y * a[low, i] + z * a[low + 1, i]
-
-
 @lru_cache(maxsize=64)
 def stage_module(mechanism: Mechanism, objective: Objective) -> Any:
     """Return the compiled module of Φ(x, u), (21): ``stage(x, u, parameters, cost)``.

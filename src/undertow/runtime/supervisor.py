@@ -65,10 +65,7 @@ class SupervisedRig:
     ``controller_timeout``, s, without an output the supervisor takes over; once it has let go it
     writes what it did to the file ``record``, as JSON.
 
-    Raises
-    ------
-    UndertowError
-        When the rig cannot be made: what was raised in the supervisor.
+    Raises what was raised in the supervisor when the rig cannot be made, an UndertowError.
     """
 
     def __init__(
@@ -222,9 +219,7 @@ def _refusal(error: Exception) -> UndertowError:
     if isinstance(error, UndertowError) and hasattr(errors, type(error).__name__):
         return error
     return ArtefactError(
-        "rig of a supervisor",
-        value=error_text(error),
-        limit="a rig that can be made and read",
+        "rig of a supervisor", value=error_text(error), limit="a rig that can be made and read"
     )
 
 

@@ -91,13 +91,9 @@ def checked_legs(
 ) -> Legs:  # fmt: skip
     """Return when the target jumps, s, and where to, the first at 0; see :func:`legs_of`.
 
-    A reference is followed for so many seconds.
-
-    Raises
-    ------
-    InvalidInputError
-        For what the mechanism cannot rest at, for what the constraints exclude, and for positions
-        past the travel at which a run stops.
+    A reference is followed for so many seconds. Raises InvalidInputError for what the mechanism
+    cannot rest at, for what the constraints exclude, and for positions past the travel at which a
+    run stops.
     """
     legs = legs_of(mechanism, objective, goal, max(seconds, 1e-3))
     low, high = settings.travels(mechanism).T
@@ -152,11 +148,7 @@ class Listener:
     """Takes targets for a run from other processes, until it is closed.
 
     The address is written beside the log. ``failure``: why it does not listen; empty while it does.
-
-    Raises
-    ------
-    ResourceError
-        When the system has no thread for it.
+    Raises ResourceError when the system has no thread for it.
     """
 
     def __init__(self, run: Steered, log: Path) -> None:
@@ -248,10 +240,7 @@ def _told(error: UndertowError) -> dict[str, Any]:
 def read_line(visitor: socket.socket, timeout: float) -> bytes:
     """Return a line that is said within so many s, without its end.
 
-    Raises
-    ------
-    OSError
-        For one that is too long, is not ended or comes too late.
+    Raises OSError for one that is too long, is not ended or comes too late.
     """
     until, line = time.monotonic() + timeout, b""
     while not line.endswith(b"\n"):

@@ -164,10 +164,7 @@ Test = Callable[[Mechanism], tuple[bool, str] | tuple[bool, str, str]]
 def self_test(progress: Progress = no_progress) -> Iterator[Result]:
     """Try one thing of each kind; ten seconds, or a minute where all has to be compiled first.
 
-    Yields
-    ------
-    Result
-        One test after another; a test that breaks off has failed, with the error's words.
+    Yields one test after another; a test that breaks off has failed, with the error's words.
     """
     mechanism = rotary_pendulum(d_e=0.025)
     tests: dict[str, Test] = {

@@ -81,25 +81,13 @@ def grouped(found: Mapping[Key, V]) -> dict[Any, list[V]]:
 class Experiment(Generic[V, R]):
     """Pure tasks, and what is made of their results.
 
-    Parameters
-    ----------
-    name
-        Of its ledger.
-    line
-        Type of the ledger's lines, see :class:`undertow.studies.ledger.Ledger`.
-    tasks
-        By their keys.  Equal settings and key give the same result anywhere.
-    settings
-        What the results depend on besides.
-    report, files
-        Show what came of them, and return it as files by their names.
-    notes
-        Sentences for the end.
-    gather
-        Makes what these take of the results by their keys: by default all of them, in the order of
-        the tasks.
-    whole
-        Whether all results are needed for that, or those that there are will do.
+    ``name``: of its ledger. ``line``: type of the ledger's lines, see
+    :class:`undertow.studies.ledger.Ledger`. ``tasks``: by their keys.  Equal settings and key give
+    the same result anywhere. ``settings``: what the results depend on besides. ``report``,
+    ``files``: show what came of them, and return it as files by their names. ``notes``: sentences
+    for the end. ``gather``: makes what these take of the results by their keys: by default all of
+    them, in the order of the tasks. ``whole``: whether all results are needed for that, or those
+    that there are will do.
     """
 
     name: str
@@ -115,10 +103,8 @@ class Experiment(Generic[V, R]):
     def ledger(self, folder: Path | None) -> Ledger[V]:
         """Return the results that a folder has, to go on with; ``None`` keeps them nowhere.
 
-        Raises
-        ------
-        ArtefactError
-            When they are of other versions or settings, or cannot be read or written.
+        Raises ArtefactError when they are of other versions or settings, or cannot be read or
+        written.
         """
         path = None if folder is None else folder / f"{self.name}.jsonl"
         return Ledger(path, self.line, self.settings)

@@ -32,11 +32,7 @@ def draw_rows(axes: Sequence[Axes], motion: Trajectory, **line: Any) -> None:
 
 
 def rows_figure(
-    motions: Iterable[tuple[Trajectory, dict[str, Any]]],
-    *,
-    until: float,
-    title: str,
-    columns: int,
+    motions: Iterable[tuple[Trajectory, dict[str, Any]]], *, until: float, title: str, columns: int
 ) -> Figure:
     """Return a figure of motions of the rotary pendulum: φ, θ and voltage over time.
 

@@ -30,14 +30,10 @@ class Ledger(Generic[V]):
 
     ``path`` is the file, continued where there is one, ``None`` keeps nothing.  ``line`` is the
     type of a line: a tuple of the key's parts and, last, the result, made of numbers, words,
-    arrays, tuples, mappings and dataclasses of these.  ``settings``, made of the same, are what
-    all results have in common: they and the versions are the file's first line.  ``known`` has the
-    results.
-
-    Raises
-    ------
-    ArtefactError
-        When the file is of other versions or settings, or cannot be read or written.
+    arrays, tuples, mappings and dataclasses of these.  ``settings``, made of the same, are what all
+    results have in common: they and the versions are the file's first line.  ``known`` has the
+    results. Raises ArtefactError when the file is of other versions or settings, or cannot be read
+    or written.
     """
 
     def __init__(self, path: Path | None, line: Any, settings: Mapping[str, Any]) -> None:
@@ -122,10 +118,7 @@ def built(kind: Any, said: Any) -> Any:
     >>> built(tuple[str, float | None], ["cost", "inf"])
     ('cost', inf)
 
-    Raises
-    ------
-    ValueError
-        For a value of another type.
+    Raises ValueError for a value of another type.
     """
     origin, args = get_origin(kind), get_args(kind)
     if origin is UnionType:

@@ -87,12 +87,8 @@ def model_files(
     """Return the experiment that reads every URDF and MJCF file below a folder.
 
     Links are not followed. ``simulate`` balances what can be as ``undertow simulate FILE`` does:
-    for the usual objective, from the usual start; ``seed`` is the optimisers'.
-
-    Raises
-    ------
-    ArtefactError
-        Where there is no such folder, or nothing in it, or too much.
+    for the usual objective, from the usual start; ``seed`` is the optimisers'. Raises ArtefactError
+    where there is no such folder, or nothing in it, or too much.
     """
     if not folder.is_dir():
         raise ArtefactError(
@@ -209,10 +205,7 @@ def _kept(rows: Sequence[ModelFile]) -> list[ModelFile]:
 def refused_groups(rows: Sequence[ModelFile]) -> Iterator[tuple[str, str, str, int]]:
     """Gather the files below one folder that are refused alike.
 
-    Yields
-    ------
-    str, str, str, int
-        The first files, what their refusal is about, the first one's reason, how many there are.
+    Yields the first files, what their refusal is about, the first one's reason, how many there are.
     """
 
     def alike(row: ModelFile) -> tuple[str, str, str]:
@@ -257,7 +250,4 @@ def files_of(rows: Sequence[ModelFile]) -> dict[str, bytes]:
     text = [summary(rows), "", *markdown_table(HEADS, map(_cells, _kept(rows)), ("n", "m")), ""]
     refused = ((names, count, about, why) for names, about, why, count in refused_groups(rows))
     text += [line.replace("<", "&lt;") for line in markdown_table(REFUSED, refused, ("number",))]
-    return {
-        "models.csv": to_csv(columns, data),
-        "models.md": ("\n".join(text) + "\n").encode(),
-    }
+    return {"models.csv": to_csv(columns, data), "models.md": ("\n".join(text) + "\n").encode()}

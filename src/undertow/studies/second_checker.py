@@ -24,10 +24,8 @@ COMPILERS = ("g++", "clang++")
 def second_checker() -> Path:
     """Return the program: in this checkout's ``build/``, else on the PATH.
 
-    Raises
-    ------
-    MissingExtraError
-        Where it is not built; the remedy names the compiler if that is missing too.
+    Raises MissingExtraError where it is not built; the remedy names the compiler if that is missing
+    too.
     """
     found = str(BUILT) if BUILT.is_file() else shutil.which(NAME)
     if found is None:
@@ -45,14 +43,8 @@ def second_checker() -> Path:
 def decide_again(file: Path, *, seconds: float = 600.0) -> list[tuple[str, float]]:
     """Return verdict and time in s of every claim of a file, in its order, by the second checker.
 
-    The file is a certificate of version 2; each claim may take ``seconds``, s.
-
-    Raises
-    ------
-    CertificateError
-        Where it refuses the file.
-    MissingExtraError
-        Where it is not built.
+    The file is a certificate of version 2; each claim may take ``seconds``, s. Raises
+    CertificateError where it refuses the file; MissingExtraError where it is not built.
     """
     command = [str(second_checker()), str(file), "--seconds", repr(float(seconds))]
     run = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -72,9 +64,7 @@ def agree(first: str, second: str) -> bool:
 
 
 def agreement_table(
-    kinds: Sequence[str],
-    first: Sequence[tuple[str, float]],
-    second: Sequence[tuple[str, float]],
+    kinds: Sequence[str], first: Sequence[tuple[str, float]], second: Sequence[tuple[str, float]]
 ) -> tuple[Table, bool]:
     """Return a table for the terminal, claim by claim, and whether both checkers agree on all.
 

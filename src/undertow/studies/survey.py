@@ -23,15 +23,7 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from undertow.base import (
-    InfeasibleError,
-    finite,
-    manifest,
-    markdown_table,
-    number,
-    table,
-    to_csv,
-)
+from undertow.base import InfeasibleError, finite, manifest, markdown_table, number, table, to_csv
 from undertow.bounds import bound
 from undertow.cascade import Cascade, Run, gate_words
 from undertow.closed_loop.figures import state_words
@@ -106,11 +98,8 @@ def survey(
     All of the library by default, for each of the ``goals``, words of
     :func:`undertow.objective_for`, within ``horizon``, s; ``bounds`` also computes the
     optimal-control bound (extra ``bounds``). ``request`` is what the manifest says was asked for.
-
-    Raises
-    ------
-    InvalidInputError
-        For an unknown mechanism or goal, or one without a usual start, before any work.
+    Raises InvalidInputError for an unknown mechanism or goal, or one without a usual start, before
+    any work.
     """
     given = {name: named(name) for name in (LIBRARY if names is None else names)}
     own = Counter(mechanism.name for mechanism in given.values())
@@ -146,13 +135,8 @@ def survey_one(
     From ``x0``, (2n,), the mechanism's listed start by default; ``goal`` is the objective's word,
     and ``name`` the mechanism's, if not its own, for the line. The motion of the bound keeps what
     is ``within`` besides the objective's own constraints: what every surface must keep anyway.
-
-    Raises
-    ------
-    InvalidInputError
-        For a state that the task does not allow.
-    MissingExtraError
-        When a bound is asked for without CasADi.
+    Raises InvalidInputError for a state that the task does not allow; MissingExtraError when a
+    bound is asked for without CasADi.
     """
     began = time.perf_counter()
     x0 = mechanism.initial_state(x0, {})
@@ -211,11 +195,7 @@ def _total(run: Run | None) -> float:
 
 
 def _bound(
-    mechanism: Mechanism,
-    objective: Objective,
-    x0: FloatArray,
-    runs: Sequence[Run],
-    longest: float,
+    mechanism: Mechanism, objective: Objective, x0: FloatArray, runs: Sequence[Run], longest: float
 ) -> float:
     """Return the bound, NaN where none was found; the cascades' own motions are guesses."""
     intervals = max(100, round(PER_CYCLE * _cycles(mechanism, longest)))

@@ -111,10 +111,7 @@ class C99Emitter(Emitter):
     def text(self, expression: sp.Expr) -> str:
         """Print one expression.
 
-        Raises
-        ------
-        ModelError
-            For a function that C99 does not know.
+        Raises ModelError for a function that C99 does not know.
         """
         try:
             return super().text(expression)

@@ -76,25 +76,13 @@ _OPERATORS: dict[type[ast.AST], str] = {
 class Translation:
     """One function of a generated module, in C++.
 
-    Parameters
-    ----------
-    source
-        The module's text.
-    name
-        The function.  Its first two parameters are the lanes from which and to which it goes; the
-        others are numbers and arrays.
-    kinds
-        Of its parameters, by name: ``"long long"``, ``"double"``, or for an array of float64 its
-        number of axes, as text; ``"switch"`` is an array of int64.
-    block
-        Lanes of a block of the work array ``W``.
-
-    Attributes
-    ----------
-    text
-        The module in C++, with an entry ``<name>_all(count, …)`` for the lanes 0 to count − 1.
-    shapes
-        Lengths that follow the parameters, as (array, axis): those that an index needs.
+    ``source``: the module's text. ``name``: the function.  Its first two parameters are the lanes
+    from which and to which it goes; the others are numbers and arrays. ``kinds``: of its
+    parameters, by name: ``"long long"``, ``"double"``, or for an array of float64 its number of
+    axes, as text; ``"switch"`` is an array of int64. ``block``: lanes of a block of the work array
+    ``W``. ``text``: the module in C++, with an entry ``<name>_all(count, …)`` for the lanes 0 to
+    count − 1. ``shapes``: lengths that follow the parameters, as (array, axis): those that an index
+    needs.
     """
 
     def __init__(self, source: str, name: str, kinds: Mapping[str, str], block: int) -> None:

@@ -18,12 +18,8 @@ _MATRICES = ("ImmutableDenseMatrix", "MutableDenseMatrix")
 def parse_expression(text: str) -> Any:
     """Return the expression or matrix that ``sympy.srepr`` wrote.
 
-    The text is calls of SymPy's own classes on numbers, texts and lists, nested.
-
-    Raises
-    ------
-    ValueError
-        For anything else.
+    The text is calls of SymPy's own classes on numbers, texts and lists, nested. Raises ValueError
+    for anything else.
     """
     return _made(ast.parse(text.strip(), mode="eval").body)
 

@@ -22,12 +22,8 @@ from sympy.simplify.fu import TR10i
 def readable(expression: sp.Expr | float, rates: Sequence[sp.Symbol] = ()) -> sp.Expr:
     """Return an equal expression that is short to read.
 
-    Parameters
-    ----------
-    expression
-        A polynomial in ``rates`` with coefficients in sines and cosines.
-    rates
-        Velocities by whose monomials the terms are collected.
+    ``expression``: a polynomial in ``rates`` with coefficients in sines and cosines. ``rates``:
+    velocities by whose monomials the terms are collected.
     """
     expression = sp.expand(_with_fractions(sp.sympify(expression)))
     polynomial = sp.Poly(expression, *rates) if rates and expression.is_polynomial(*rates) else None

@@ -57,10 +57,7 @@ class SymbolNames:
 def distinct(symbols: Iterable[sp.Symbol]) -> list[sp.Symbol]:
     """Return the inputs of generated code, refusing a symbol that would stand for two of them.
 
-    Raises
-    ------
-    ModelError
-        With the symbol that occurs twice.
+    Raises ModelError with the symbol that occurs twice.
     """
     listed = list(symbols)
     repeated = sorted({str(s) for s in listed if listed.count(s) > 1})

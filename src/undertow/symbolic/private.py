@@ -24,10 +24,7 @@ from undertow.base.errors import or_refused
 def cache_folder() -> Path:
     """Return the folder of generated kernels: ``$UNDERTOW_CACHE`` or the user's cache.
 
-    Raises
-    ------
-    RuntimeError
-        When the user has no home.
+    Raises RuntimeError when the user has no home.
     """
     chosen = os.environ.get("UNDERTOW_CACHE")
     if chosen:
@@ -39,13 +36,9 @@ def cache_folder() -> Path:
 def private_folder() -> Path:
     """Return the cache folder where it is this user's alone, or else a temporary one that is.
 
-    The folder in the temporary directory is made for the user, and kept; where somebody else
-    has made one of its name, a new one is made for this process, and removed at its end.
-
-    Raises
-    ------
-    ArtefactError
-        When there is no such folder, and none can be made.
+    The folder in the temporary directory is made for the user, and kept; where somebody else has
+    made one of its name, a new one is made for this process, and removed at its end. Raises
+    ArtefactError when there is no such folder, and none can be made.
     """
     for folder in _candidates():
         try:

@@ -38,12 +38,8 @@ _cos_{i} = g_{i} * (1.0 - 2.0 * o_{i}) * (pc_{i} if o_{i} == 0.0 else ps_{i})
 class ScalarCode:
     """Scalar arithmetic as a printer of SymPy's writes it: powers multiplied out, names by place.
 
-    Attributes
-    ----------
-    names
-        Of symbols.
-    functions
-        The language's square root, power, maximum and minimum of two.
+    ``names``: of symbols. ``functions``: the language's square root, power, maximum and minimum of
+    two.
     """
 
     names: SymbolNames

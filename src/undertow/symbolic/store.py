@@ -34,10 +34,7 @@ KEPT = 1024
 def content_key(*texts: str) -> str:
     """Return a hash of texts, of the sources of this package, and of versions.
 
-    Parameters
-    ----------
-    *texts
-        Everything else that a stored result depends on.
+    ``*texts``: everything else that a stored result depends on.
     """
     digest = hashlib.sha256(_versions().encode())
     for text in (*texts, sources_digest()):
@@ -120,12 +117,8 @@ def _write(path: Path, text: str) -> None:
 def load_module(name: str, source: str) -> ModuleType:
     """Import ``source`` from the cache, writing it first if it is new.
 
-    The file appears whole or not at all, so several processes may ask at once.
-
-    Raises
-    ------
-    ArtefactError
-        When the disk refuses.
+    The file appears whole or not at all, so several processes may ask at once. Raises ArtefactError
+    when the disk refuses.
     """
     digest = hashlib.sha256((_versions() + source).encode()).hexdigest()[:16]
     module_name = f"{re.sub(r'[^A-Za-z0-9_]', '_', name)[:80]}_{digest}"

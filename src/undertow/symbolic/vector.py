@@ -34,10 +34,7 @@ def compile_numpy(
 ) -> VectorFunction:
     """Return a function of ``inputs`` (arrays that broadcast) giving a list of ``outputs``.
 
-    Raises
-    ------
-    ModelError
-        For a symbol that is neither an input nor on the tape.
+    Raises ModelError for a symbol that is neither an input nor on the tape.
     """
     given = {s: sp.Symbol(f"a{i}", real=True) for i, s in enumerate(distinct(inputs))}
     lines = tape.live(outputs)
@@ -60,12 +57,7 @@ def compile_expressions(
     """Return a function of ``inputs`` giving ``outputs``, each evaluated as it is written.
 
     Where :func:`compile_numpy` shares what outputs have in common, this keeps the order of
-    operations that SymPy prints.
-
-    Raises
-    ------
-    ModelError
-        For a symbol that is no input.
+    operations that SymPy prints. Raises ModelError for a symbol that is no input.
     """
     results = [sp.sympify(o) for o in outputs]
     _refuse(set().union(*(e.free_symbols for e in results)) - set(inputs))

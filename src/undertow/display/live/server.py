@@ -119,19 +119,9 @@ class Viewer:
 class Server:
     """Serves a show until it is stopped.
 
-    Parameters
-    ----------
-    show
-        What is shown.
-    port
-        Of 127.0.0.1; by default 8417, or any free one where that is taken.
-    over
-        Whether the show has ended: then its viewers are told the rest, and so ends the server.
-
-    Attributes
-    ----------
-    address
-        Where the page is, with its token; known once it listens.
+    ``show``: what is shown. ``port``: of 127.0.0.1; by default 8417, or any free one where that is
+    taken. ``over``: whether the show has ended: then its viewers are told the rest, and so ends the
+    server. ``address``: where the page is, with its token; known once it listens.
     """
 
     def __init__(

@@ -147,10 +147,7 @@ def from_matrices(
 def check_balanced(mechanism: Mechanism) -> None:
     """Refuse a target that is no equilibrium: f_u(0, 0) ≠ 0, which no input can balance.
 
-    Raises
-    ------
-    ModelError
-        With the largest force and the coordinate that it acts on.
+    Raises ModelError with the largest force and the coordinate that it acts on.
     """
     n, m = mechanism.n, mechanism.m
     residual = np.abs(mechanism.f(np.zeros(2 * n))[m:])
@@ -187,11 +184,7 @@ def _newton(mechanism: Mechanism) -> tuple[FloatArray, float]:
     """Solve f_u(q, 0) = 0 for the free coordinates, from the target on, by Newton's method.
 
     Without SciPy's solvers: the verifier of proofs checks targets too, and imports no solver.
-
-    Returns
-    -------
-    numpy.ndarray, float
-        Positions, (n,), and the |f_u| that is left, relative to :func:`force_scale`.
+    Returns positions, (n,), and the |f_u| that is left, relative to :func:`force_scale`.
     """
     n, m, scale = mechanism.n, mechanism.m, force_scale(mechanism)
     x, steps = np.zeros(2 * n), 1e-6 * np.eye(2 * n)[m:n]
@@ -276,10 +269,7 @@ def lagrange_force(
 def unit_inputs(coordinates: Sequence[Coordinate], actuated: Sequence[str]) -> sp.Matrix:
     """Return the (n, m) input matrix of inputs that act on single coordinates, by name.
 
-    Raises
-    ------
-    InvalidInputError
-        For a name that does not exist, or one that occurs twice.
+    Raises InvalidInputError for a name that does not exist, or one that occurs twice.
     """
     names = [c.name for c in coordinates]
     for joint in actuated:
@@ -332,10 +322,7 @@ def shifted(
 
 
 def _symmetric(
-    name: str,
-    mass: sp.Matrix,
-    coordinates: Sequence[Coordinate],
-    values: Mapping[sp.Symbol, float],
+    name: str, mass: sp.Matrix, coordinates: Sequence[Coordinate], values: Mapping[sp.Symbol, float]
 ) -> sp.Matrix:
     """Return the upper half mirrored, after a numeric look at M − Mᵀ where it is not plain."""
     n = len(coordinates)

@@ -132,10 +132,7 @@ def at_equilibrium(mechanism: Mechanism, target: str | Mapping[str, float] = "")
 def where(mechanism: Mechanism, target: str | Mapping[str, float]) -> tuple[dict[str, float], str]:
     """Return the equilibrium that :func:`at_equilibrium` takes, by coordinates, and its words.
 
-    Raises
-    ------
-    ModelError, InvalidInputError
-        As for that.
+    Raises ModelError or InvalidInputError as for that.
     """
     if isinstance(target, Mapping):
         guess = _positions(mechanism, target)
@@ -343,11 +340,7 @@ def _usual_start(mechanism: Mechanism) -> tuple[dict[str, float], float]:
     """Return a start that the inputs can bring home: 5° or 5 cm off in the first free coordinate.
 
     Where the linear model needs more than the limits for that, so much closer that it needs half.
-
-    Returns
-    -------
-    dict, float
-        The start, and what 5° or 5 cm need of the limits.
+    Returns the start, and what 5° or 5 cm need of the limits.
     """
     free = mechanism.coordinates[mechanism.m]
     off = min(_OFF.get(free.unit, 0.05), 0.5 * free.high, -0.5 * free.low)
@@ -441,12 +434,8 @@ def _solved(mechanism: Mechanism, q: FloatArray, kept: int) -> tuple[FloatArray,
     """Solve f(q, 0) = 0 for the coordinates behind the first ``kept``, from q on.
 
     As many equations as coordinates are kept are left out: those of the inputs, where the m
-    actuated ones are.
-
-    Returns
-    -------
-    numpy.ndarray, float
-        Positions, (n,), and the force that is left, relative to :func:`force_scale`.
+    actuated ones are. Returns positions, (n,), and the force that is left, relative to
+    :func:`force_scale`.
     """
     from scipy.optimize import root  # slow to import
 

@@ -43,10 +43,7 @@ FORMATS: Mapping[str, Format] = {".urdf": URDF, ".xml": MJCF, ".mjcf": MJCF}
 def format_of(path: Path) -> Format:
     """Return the format of a file, by the end of its name.
 
-    Raises
-    ------
-    InvalidInputError
-        For one that is not in the list.
+    Raises InvalidInputError for one that is not in the list.
 
     Examples
     --------

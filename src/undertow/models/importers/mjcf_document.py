@@ -61,16 +61,10 @@ class Document:
 def mjcf_document(source: str | Path, frozen: Sequence[str] = ()) -> Document:
     """Read an MJCF file or text with all that it includes.
 
-    Joints that are ``frozen`` are taken out: their bodies stay where they are drawn.
-
-    Raises
-    ------
-    ArtefactError
-        For a file that cannot be read.
-    InvalidInputError
-        For what is no XML or is too large, and for a frozen joint that does not exist.
-    ModelError
-        For what is no model, a model in which nothing moves or too much does, and free bodies.
+    Joints that are ``frozen`` are taken out: their bodies stay where they are drawn. Raises
+    ArtefactError for a file that cannot be read; InvalidInputError for what is no XML or is too
+    large, and for a frozen joint that does not exist; ModelError for what is no model, a model in
+    which nothing moves or too much does, and free bodies.
     """
     folder = None if is_text(source) else Path(source).parent
     root = parse_xml(source, "mujoco")

@@ -125,10 +125,7 @@ def _of_any_inertia(mujoco: Any, document: Document) -> Any:
 def tree_of(mujoco: Any, model: Any, name: str, *, motors: bool = True) -> Tree:
     """Return a compiled model as a tree; ``motors=False`` leaves its actuators out.
 
-    Raises
-    ------
-    ModelError
-        For what is no tree of rigid bodies with motors in still air.
+    Raises ModelError for what is no tree of rigid bodies with motors in still air.
     """
     _check_world(mujoco, model)
     reader = _Compiled(mujoco, model)
@@ -449,24 +446,12 @@ def compared(
 ) -> str:
     """Say in words how a mechanism's accelerations at random states are those of MuJoCo.
 
-    Parameters
-    ----------
-    mechanism
-        As it was read, with the inputs of ``tree`` or with joints named as actuated.
-    tree
-        Its bodies and joints.
-    model
-        The engine's compiled model of the same file; dry friction, ranges of joints and contacts
-        are switched off in a copy.
-    q_target
-        The target in the mechanism's coordinates as they are before it is made zero.
-    driven
-        Whether the mechanism's inputs are the tree's actuators; else MuJoCo's are switched off.
-
-    Raises
-    ------
-    ModelError
-        Where the largest relative difference is beyond :data:`AGREEMENT`.
+    ``mechanism``: as it was read, with the inputs of ``tree`` or with joints named as actuated.
+    ``tree``: its bodies and joints. ``model``: the engine's compiled model of the same file; dry
+    friction, ranges of joints and contacts are switched off in a copy. ``q_target``: the target in
+    the mechanism's coordinates as they are before it is made zero. ``driven``: whether the
+    mechanism's inputs are the tree's actuators; else MuJoCo's are switched off. Raises ModelError
+    where the largest relative difference is beyond :data:`AGREEMENT`.
     """
     mujoco = engine()
     assert mujoco is not None  # it compiled the model

@@ -76,16 +76,9 @@ def named_in_file(
     """Run a Python file, and return what ``use`` makes of what one of its names holds.
 
     Without a name in ``FILE.py:NAME`` the message says which there are that ``suits`` says yes to;
-    ``what`` is looked for, in a word, for messages.
-
-    Raises
-    ------
-    ArtefactError
-        When the file cannot be read or fails, with its line.
-    InvalidInputError
-        When the text is of another form, or the file has no such name.
-    UndertowError
-        What the file itself met, with its line.
+    ``what`` is looked for, in a word, for messages. Raises ArtefactError when the file cannot be
+    read or fails, with its line; InvalidInputError when the text is of another form, or the file
+    has no such name; UndertowError for what the file itself met, with its line.
     """
     file, _, name = (text, "", "") if text.endswith(".py") else text.rpartition(":")
     if not (file.endswith(".py") and (name.isidentifier() or file == text)):

@@ -14,10 +14,7 @@ from undertow.models.mechanism import Coordinate, Mechanism
 def names_of(given: Sequence[str], what: str, of: str = "") -> list[str]:
     """Return names of joints, those of a tree ``of``, as a list; one alone may be a plain text.
 
-    Raises
-    ------
-    InvalidInputError
-        For what is no name.
+    Raises InvalidInputError for what is no name.
     """
     names = [given] if isinstance(given, str) else list(given)
     odd = [name for name in names if not isinstance(name, str)]

@@ -138,12 +138,8 @@ def mechanism_from_tree(
 def check_held(tree: Tree, actuated: Sequence[str]) -> None:
     """Refuse a tree that falls whatever its joints do: no pose of it is an equilibrium.
 
-    The tree has the file's own actuators; joints that are driven besides are ``actuated``.
-
-    Raises
-    ------
-    ModelError
-        For a slide that nothing but contact could hold against gravity.
+    The tree has the file's own actuators; joints that are driven besides are ``actuated``. Raises
+    ModelError for a slide that nothing but contact could hold against gravity.
     """
     driven = {name for a in tree.actuators for name in a.coefficients} | set(actuated)
     driven |= {name for c in tree.couplings if c.stiffness for name in c.coefficients}

@@ -239,18 +239,17 @@ class Tree:
             )
         self._check_inertia()
 
-    def _hanging(self) -> dict[str, list[Joint]]:
-        """Links to the joints that hang on them."""
+    def ordered(self) -> list[Joint]:
+        """Return the joints from the root outwards."""
+        return self._beyond(WORLD)
+
+    def _beyond(self, link: str) -> list[Joint]:
+        """Return the joints from a link outwards."""
         children: dict[str, list[Joint]] = {}
         for joint in self.joints:
             children.setdefault(joint.parent, []).append(joint)
-        return children
-
-    def ordered(self) -> list[Joint]:
-        """Return the joints from the root outwards."""
-        children = self._hanging()
         order: list[Joint] = []
-        frontier = [WORLD]
+        frontier = [link]
         while frontier:
             hanging = children.get(frontier.pop(0), [])
             order += hanging
@@ -311,20 +310,15 @@ class Tree:
                     remedy="Check the units, and that the moments are about the centre of mass; a "
                     "thin rod has one that is zero and two that are equal",
                 )
-        hanging = self._hanging()
         armed = {j for c in self.couplings if c.armature > 0 for j in c.coefficients}
         for joint in self.moving:
-            beyond, frontier = [joint.child], [joint.child]
-            while frontier:
-                ends = [j.child for j in hanging.get(frontier.pop(), [])]
-                beyond += ends
-                frontier += ends
-            carried = [links[name] for name in beyond]
+            further = self._beyond(joint.child)
+            carried = [links[j.child] for j in (joint, *further)]
             mass = sum(link.mass for link in carried)
             turning = sum(float(np.trace(link.inertia)) for link in carried)
             if joint.kind == "hinge":
                 turning += sum(link.mass * float(np.dot(link.com, link.com)) for link in carried)
-                turning += mass if len(beyond) > 1 else 0.0
+                turning += mass if further else 0.0
                 turning += mass * float(np.dot(joint.anchor, joint.anchor))
             heavy = mass > 0 if joint.kind == "slide" else turning > 0
             if not (heavy or joint.armature > 0 or joint.name in armed):

@@ -53,16 +53,8 @@ def parse_xml(source: str | Path, root: str, *more: str) -> ET.Element:
     """Parse XML text (it starts with ``<``) or a file, and check the name of its root.
 
     A declaration that does not come first is passed over, and ``$(optenv NAME DEFAULT)`` is its
-    default.
-
-    Raises
-    ------
-    ArtefactError
-        When the file cannot be read.
-    InvalidInputError
-        For XML that is not well formed, or declares entities.
-    ModelError
-        For another root element.
+    default. Raises ArtefactError when the file cannot be read; InvalidInputError for XML that is
+    not well formed, or declares entities; ModelError for another root element.
     """
     what = source_words(source, root)
     if not isinstance(source, str | Path):
@@ -86,10 +78,7 @@ def parse_xml(source: str | Path, root: str, *more: str) -> ET.Element:
             ) from error
     if "<!ENTITY" in text:
         raise InvalidInputError(
-            what,
-            value="entity declarations",
-            limit="plain XML",
-            remedy="Expand the entities first",
+            what, value="entity declarations", limit="plain XML", remedy="Expand the entities first"
         )
     text = _DEFAULTED.sub(r"\1", _DECLARATION.sub("", text)).rstrip("\0 \t\r\n")
     try:
@@ -116,10 +105,7 @@ def parse_xml(source: str | Path, root: str, *more: str) -> ET.Element:
 def _check_size(text: str, what: str) -> None:
     """Refuse what is nested or repeated beyond any mechanism, before a tree is built of it.
 
-    Raises
-    ------
-    InvalidInputError
-        Beyond :data:`DEEPEST` or :data:`MOST`.
+    Raises InvalidInputError beyond :data:`DEEPEST` or :data:`MOST`.
     """
     depth = count = 0
 
@@ -148,10 +134,7 @@ def _check_size(text: str, what: str) -> None:
 def computable(what: str) -> Iterator[None]:
     """Refuse numbers of a file from which no mechanism can be computed.
 
-    Raises
-    ------
-    InvalidInputError
-        Where arithmetic overflows or has no result.
+    Raises InvalidInputError where arithmetic overflows or has no result.
     """
     try:
         yield
@@ -175,13 +158,8 @@ def numbers_of(
     """Return the numbers of an attribute; ``of`` names what the element belongs to.
 
     Commas do as well as spaces; surplus zeros and the stop of ``1.57.`` are passed over: people's
-    files have them.
-
-    Raises
-    ------
-    InvalidInputError
-        When the attribute is missing (and has no default), holds something else than finite
-        numbers, or another count of them.
+    files have them. Raises InvalidInputError when the attribute is missing (and has no default),
+    holds something else than finite numbers, or another count of them.
     """
     text = element.get(attribute, default)
     owner = of or element.get("name", "")

@@ -28,12 +28,7 @@ from undertow.proofs.kernel.reader import LARGEST, Document
 class StatedClaim:
     """A claim as the kernel decides it, with the verdict that was given.
 
-    Parameters
-    ----------
-    claim
-        Its numbers, exact.
-    verdict
-        ``undecided`` for what was only read from a file.
+    ``claim``: its numbers, exact. ``verdict``: ``undecided`` for what was only read from a file.
     """
 
     claim: kernel.Claim
@@ -49,14 +44,8 @@ class StatedClaim:
 class Subject:
     """A surface with its reaching law, what is proved of it, and what is not.
 
-    Parameters
-    ----------
-    surface, reaching
-        The law.
-    claims
-        Proved claims, or those of a file.
-    remarks
-        Other verdicts, for people: no file keeps them.
+    ``surface``, ``reaching``: the law. ``claims``: proved claims, or those of a file. ``remarks``:
+    other verdicts, for people: no file keeps them.
     """
 
     surface: Surface
@@ -69,14 +58,8 @@ class Subject:
 class Certificate:
     """Subjects of one mechanism, and the file that states their claims.
 
-    Parameters
-    ----------
-    name
-        The mechanism's.
-    subjects
-        What is certified.
-    content
-        The file; empty where no claim is proved.
+    ``name``: the mechanism's. ``subjects``: what is certified. ``content``: the file; empty where
+    no claim is proved.
     """
 
     name: str

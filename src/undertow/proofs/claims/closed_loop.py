@@ -25,10 +25,7 @@ from undertow.proofs.kernel.model import Model, Quantity
 class LoopClaim(Claim):
     """Every motion from a box of starts converges, with the boundary layer and the input clip.
 
-    Parameters
-    ----------
-    data
-        Its numbers as ``docs/certificate-format.md``, section 5.6, has them.
+    ``data``: its numbers as ``docs/certificate-format.md``, section 5.6, has them.
     """
 
     data: Mapping[str, Any]

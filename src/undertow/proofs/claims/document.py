@@ -26,10 +26,7 @@ def document_bytes(
 ) -> bytes:
     """Return the file; every number in it is exact.  Whoever keeps it reads it first.
 
-    Raises
-    ------
-    CertificateError
-        For a model or a law that a certificate cannot hold.
+    Raises CertificateError for a model or a law that a certificate cannot hold.
     """
     model = model_data(mechanism)
     document: dict[str, Any] = {
@@ -66,10 +63,7 @@ def json_bytes(document: Mapping[str, Any]) -> bytes:
 def read_document(content: bytes) -> Document:
     """Read a file, its claims too.
 
-    Raises
-    ------
-    CertificateError
-        For what is damaged or unknown.
+    Raises CertificateError for what is damaged or unknown.
     """
     try:
         document = read(content)

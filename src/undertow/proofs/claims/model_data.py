@@ -155,12 +155,8 @@ def _graph(mechanism: Mechanism) -> tuple[Any, ...]:
 def model_data(mechanism: Mechanism) -> dict[str, Any]:
     """Return the ``model`` of a certificate.
 
-    Raises
-    ------
-    InvalidInputError
-        For a force that depends on time.
-    ModelError
-        For a model that is not smooth, or has a function that no node stands for.
+    Raises InvalidInputError for a force that depends on time; ModelError for a model that is not
+    smooth, or has a function that no node stands for.
     """
     exact = exact_mechanism(mechanism)
     require_autonomous(exact, "certificate")
@@ -200,12 +196,8 @@ def _holds(name: str, otherwise: str, what: str = r"[^\W\d]\w{0,63}") -> str:
 def model_of(mechanism: Mechanism) -> Model:
     """Return the kernel's model of a mechanism.
 
-    Raises
-    ------
-    InvalidInputError, ModelError
-        As :func:`model_data`.
-    CertificateError
-        For names or sizes that a certificate cannot hold.
+    Raises InvalidInputError or ModelError as :func:`model_data`; CertificateError for names or
+    sizes that a certificate cannot hold.
     """
     try:
         return read_model(model_data(mechanism))

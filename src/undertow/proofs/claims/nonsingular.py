@@ -37,11 +37,8 @@ FAR = 1e9
 def exact_region(mechanism: Mechanism, region: Box) -> dict[str, tuple[Fraction, Fraction]]:
     """Return the rational numbers that the ends of a region of positions are.
 
-    Raises
-    ------
-    InvalidInputError
-        For an unknown coordinate or an interval that is empty, not finite or leaves out
-        the target, from which the non-singular set must be connected.
+    Raises InvalidInputError for an unknown coordinate or an interval that is empty, not finite or
+    leaves out the target, from which the non-singular set must be connected.
     """
     names = [c.name for c in mechanism.coordinates]
     for name, (low, high) in region.items():
@@ -95,11 +92,7 @@ def largest(
 
 
 def nonsingular(
-    mechanism: Mechanism,
-    surface: Surface,
-    region: Box,
-    *,
-    max_boxes: int = MOST_BOXES,
+    mechanism: Mechanism, surface: Surface, region: Box, *, max_boxes: int = MOST_BOXES
 ) -> Verdict:
     """Decide whether the law exists all over a region, the general form of (37).
 
@@ -136,11 +129,7 @@ def nonsingular(
 
 
 def singular_distance(
-    mechanism: Mechanism,
-    surface: Surface,
-    region: Box,
-    *,
-    tolerance: float = 1e-6,
+    mechanism: Mechanism, surface: Surface, region: Box, *, tolerance: float = 1e-6
 ) -> tuple[float, float]:
     """Return by what factor a region may grow: proved non-singular, and refuted.
 
@@ -176,10 +165,7 @@ def singular_distance(
 class NonsingularClaim(Claim):
     """The law exists all over a region of positions.
 
-    Parameters
-    ----------
-    region
-        Coordinate name to (low, high), SI units; coordinates left out stay at the target.
+    ``region``: coordinate name to (low, high), SI units; coordinates left out stay at the target.
     """
 
     region: Box

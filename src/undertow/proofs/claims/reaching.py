@@ -86,15 +86,10 @@ class DisturbanceBound:
 class ReachingCertificate:
     """What (16) guarantees over a region.
 
-    Parameters
-    ----------
-    verdict
-        Whether (16) holds for the disturbance bounds that were declared, all acting at
-        once; the margin is k_i − η_i − Σ|W_ij| ḡ_j at its smallest, in units of s per s.
-    largest
-        Per coordinate, the largest disturbance acting alone.
-    scale
-        All declared bounds may grow together by this proved factor (inf if all are 0).
+    ``verdict``: whether (16) holds for the disturbance bounds that were declared, all acting at
+    once; the margin is k_i − η_i − Σ|W_ij| ḡ_j at its smallest, in units of s per s. ``largest``:
+    per coordinate, the largest disturbance acting alone. ``scale``: all declared bounds may grow
+    together by this proved factor (inf if all are 0).
     """
 
     verdict: Verdict
@@ -282,14 +277,9 @@ class _Condition:
 class ReachingClaim(Claim):
     """The law overcomes disturbances over a region of positions, and reaches the surface.
 
-    Parameters
-    ----------
-    region
-        Coordinate name to (low, high), SI units; coordinates left out stay at the target.
-    eta
-        Reaching rate η_i ≥ 0 that (16) leaves, (m,).
-    disturbance
-        Bounds |g_j| ≤ ḡ_j, all acting at once, (n,), N m or N.
+    ``region``: coordinate name to (low, high), SI units; coordinates left out stay at the target.
+    ``eta``: reaching rate η_i ≥ 0 that (16) leaves, (m,). ``disturbance``: bounds |g_j| ≤ ḡ_j, all
+    acting at once, (n,), N m or N.
     """
 
     region: Box

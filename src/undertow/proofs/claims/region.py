@@ -32,14 +32,9 @@ from undertow.proofs.region.motion import SurfaceMotion
 class RegionClaim(Claim):
     """Motions on the surface converge from a set that contains a start.
 
-    Parameters
-    ----------
-    functions
-        A chain of V from the innermost set to the outermost.
-    start
-        A point y = (q_u, q̇_u, w) inside, (N,); the line to it from 0 is inside too.
-    parameters
-        Parameters that are only known to lie in [low, high], SI units.
+    ``functions``: a chain of V from the innermost set to the outermost. ``start``: a point y =
+    (q_u, q̇_u, w) inside, (N,); the line to it from 0 is inside too. ``parameters``: parameters
+    that are only known to lie in [low, high], SI units.
     """
 
     functions: tuple[LyapunovFunction, ...]

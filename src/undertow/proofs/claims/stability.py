@@ -29,12 +29,8 @@ def exact_linearisation(mechanism: Mechanism) -> list[list[Span]]:
     """Return [M | F | D] at the target, n rows of 3n numbers.
 
     ``M q̈ = F q + D q̇`` near x = 0; entries are exact where the model is rational at the target
-    with its float parameters taken as the binary numbers that they are.
-
-    Raises
-    ------
-    ModelError
-        For a model that is not smooth.
+    with its float parameters taken as the binary numbers that they are. Raises ModelError for a
+    model that is not smooth.
     """
     n, m = mechanism.n, mechanism.m
     blocks = [np.eye(m), np.eye(m), np.zeros((m, n - m)), np.zeros((m, n - m))]

@@ -17,13 +17,7 @@ from numpy.typing import ArrayLike
 
 from undertow.base.arguments import require
 from undertow.base.verdict import Verdict, inward
-from undertow.law import (
-    LawLayout,
-    ProvedSet,
-    ReachingLaw,
-    Surface,
-    check_surface_shape,
-)
+from undertow.law import LawLayout, ProvedSet, ReachingLaw, Surface, check_surface_shape
 from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.claim import Claim
 from undertow.proofs.claims.model_data import law_of, model_of
@@ -40,14 +34,8 @@ from undertow.proofs.require import require_autonomous
 class TerminalEllipsoid(Claim):
     """The ellipsoid {x : |W x| ≤ radius} of the full state x = (q, q̇) as a terminal set.
 
-    Parameters
-    ----------
-    W
-        (2n, 2n), invertible.
-    U
-        (2n, 2n), close to W⁻¹ up to a scaling: the witness of the proof.
-    radius
-        ρ > 0.
+    ``W``: (2n, 2n), invertible. ``U``: (2n, 2n), close to W⁻¹ up to a scaling: the witness of the
+    proof. ``radius``: ρ > 0.
     """
 
     W: FloatArray

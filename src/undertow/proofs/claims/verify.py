@@ -58,20 +58,9 @@ def match(
 ) -> Mechanism:
     """Return the mechanism that a certificate is about, or refuse.
 
-    Parameters
-    ----------
-    certificate
-        From the file.
-    mechanism
-        What it should be about.
-    own_parameters
-        The mechanism's parameters count, and must be the certificate's; otherwise it takes
-        the certificate's.
-
-    Raises
-    ------
-    CertificateError
-        For other equations, parameters or input limits.
+    ``certificate``: from the file. ``mechanism``: what it should be about. ``own_parameters``: the
+    mechanism's parameters count, and must be the certificate's; otherwise it takes the
+    certificate's. Raises CertificateError for other equations, parameters or input limits.
     """
     own, name = certificate, mechanism.name
     _require(

@@ -14,11 +14,7 @@ from numpy.typing import ArrayLike
 from undertow.base.arguments import require
 from undertow.law import Surface, check_surface_shape
 from undertow.models.mechanism import FloatArray, Mechanism, Parameter
-from undertow.proofs.exact_model import (
-    exact_matrix,
-    exact_mechanism,
-    is_odd,
-)
+from undertow.proofs.exact_model import exact_matrix, exact_mechanism, is_odd
 from undertow.proofs.require import require_autonomous
 from undertow.symbolic import Tape, compile_numpy
 
@@ -41,17 +37,9 @@ def unused(names: Iterable[str], taken: Collection[str]) -> list[str]:
 class SurfaceMotion:
     """The sliding dynamics of a mechanism in y = (q_u, q̇_u, w), of order N = 2n − m.
 
-    Parameters
-    ----------
-    mechanism, surface
-        Whose motion, on which surface; w = q_a + λ_a⁻¹ λ_u q_u.
-
-    Raises
-    ------
-    InvalidInputError
-        For a surface of another size, with a singular λ_a, or a force that depends on time.
-    ModelError
-        For a model that is not smooth.
+    ``mechanism``, ``surface``: whose motion, on which surface; w = q_a + λ_a⁻¹ λ_u q_u. Raises
+    InvalidInputError for a surface of another size, with a singular λ_a, or a force that depends on
+    time; ModelError for a model that is not smooth.
     """
 
     mechanism: Mechanism
@@ -155,17 +143,13 @@ class SurfaceMotion:
         """Return ẏ at the points y: (…, N) to (…, N)."""
         return np.stack(self._evaluate(y)[:-1], axis=-1)
 
-    def determinant(self, y: ArrayLike) -> FloatArray:
-        """Return the determinant at the points y, (…,)."""
-        return np.asarray(self._evaluate(y)[-1])
-
     @cached_property
     def _at_target(self) -> float:
-        return float(self.determinant(np.zeros(self.size)))
+        return float(self._evaluate(np.zeros(self.size))[-1])
 
     def margin(self, y: ArrayLike) -> FloatArray:
-        """Return what is left of the determinant at points y, as a part of that at the target."""
-        return np.asarray(self.determinant(y) / self._at_target)
+        """Return what is left of det E at the points y, (…,), as a part of that at the target."""
+        return np.asarray(self._evaluate(y)[-1] / self._at_target)
 
     @cached_property
     def jacobian(self) -> FloatArray:

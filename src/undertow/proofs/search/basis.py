@@ -82,10 +82,7 @@ def linear_part(motion: SurfaceMotion, chart: LyapunovFunction) -> FloatArray:
 def slowest_rate(motion: SurfaceMotion) -> float:
     """Return the slowest decay of the linearisation, 1/s.
 
-    Raises
-    ------
-    UnstableSurfaceError
-        Where it does not decay.
+    Raises UnstableSurfaceError where it does not decay.
     """
     rate = float(-np.linalg.eigvals(motion.jacobian).real.max())
     if not rate > 0:

@@ -69,18 +69,8 @@ def grow(
 ) -> list[LyapunovFunction]:
     """Return functions whose sets reach further and further along ``way``, each for the last.
 
-    Parameters
-    ----------
-    motion
-        The motion.
-    V
-        The first set, {V ≤ 1}.
-    way
-        Direction in y, (N,).
-    degree
-        Even degree of the functions.
-    budget
-        What may be spent.
+    ``motion``: the motion. ``V``: the first set, {V ≤ 1}. ``way``: direction in y, (N,).
+    ``degree``: even degree of the functions. ``budget``: what may be spent.
     """
     chain: list[LyapunovFunction] = []
     growth, step = 0.06, 0.04

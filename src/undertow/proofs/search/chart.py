@@ -48,16 +48,9 @@ def natural_stretch(
 ) -> tuple[FloatArray, float] | None:
     """Return S, (J, 3, 3), and L for one unactuated and one actuated coordinate.
 
-    Parameters
-    ----------
-    slow
-        Third coordinate η, not w: often better with |λ_a| large against the other rates.
-
-    Returns
-    -------
-    S, L or None
-        None where the motion has no such form: several unactuated coordinates, no
-        singularity within reach, or a force that does not restore.
+    ``slow``: third coordinate η, not w: often better with |λ_a| large against the other rates.
+    Returns ``None`` where the motion has no such form: several unactuated coordinates, no
+    singularity within reach, or a force that does not restore.
     """
     if (motion.mechanism.n, motion.mechanism.m) != (2, 1):
         return None

@@ -53,14 +53,8 @@ MORE_PIECES, LEAST_WIDER = 8, 1.02
 class ProvedLoop:
     """Starts from which the loop converges.
 
-    Parameters
-    ----------
-    claim
-        What was found.
-    verdict
-        Its verdict, by the kernel.
-    seconds
-        Process time of search and proof together.
+    ``claim``: what was found. ``verdict``: its verdict, by the kernel. ``seconds``: process time of
+    search and proof together.
     """
 
     claim: LoopClaim
@@ -98,12 +92,8 @@ def follow(
     """Return float64 RK4 motions of the clipped loop from states (L, 2n), and their times.
 
     Steps are of ε/η, the time in which s decays in the layer, and of 5 ms at most; with the input
-    held for a period, they are periods.
-
-    Returns
-    -------
-    tuple of ndarray
-        States (K + 1, L, 2n), every so many steps, and times (K + 1,), s.
+    held for a period, they are periods. Returns states (K + 1, L, 2n), every so many steps, and
+    times (K + 1,), s.
     """
     n = law.mechanism.n
     eta, layer = law.reaching.per_surface(law.mechanism.m)
@@ -355,10 +345,7 @@ class _Task:
     def aimed(self, duration: float) -> tuple[Loop, kernel.TerminalEllipsoid]:
         """Return the loop with a proved terminal set that simulated motions enter early.
 
-        Raises
-        ------
-        InfeasibleError
-            Where none is found.
+        Raises InfeasibleError where none is found.
         """
         n, period = self.mechanism.n, float(self.period)
         steered = SlidingModeLaw(self.mechanism, self.surface, self.law)

@@ -22,11 +22,8 @@ def minimise_linear(
 ) -> FloatArray | None:
     """Minimise c·x subject to A x ≤ b.
 
-    Returns
-    -------
-    numpy.ndarray or None
-        x, or ``None`` where no solution was reached (infeasible, unbounded, or too ill
-        conditioned).  It feeds a search whose result is verified elsewhere.
+    Returns x, or ``None`` where no solution was reached (infeasible, unbounded, or too ill
+    conditioned).  It feeds a search whose result is verified elsewhere.
     """
     rows = np.abs(A).max(axis=1)
     columns = np.abs(A).max(axis=0)

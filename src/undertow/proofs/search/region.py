@@ -97,30 +97,15 @@ def search_region(
 ) -> Chain:
     """Find a chain whose last set {V ≤ 1} reaches far along a direction of y, by sampling.
 
-    Parameters
-    ----------
-    motion
-        The sliding dynamics.
-    direction
-        In y, (N,); on a surface y = (q_u, q̇_u, w), so (1, 0, 0) is an angle at rest.
-    degrees
-        Even degrees of the functions, one after the other; the first V is quadratic.
-    programs
-        Linear programs at most, shared by the degrees.
-    seconds
-        Process time at most, likewise.
-    start
-        The quadratic V to begin with: ``"far"`` reaches far along the direction and grows
-        little; ``"round"`` starts closer and grows further; ``"balanced"`` is for coordinates
-        of very different sizes.
-    slow
-        On a surface with one unactuated coordinate: whether the third of the coordinates of
-        :mod:`undertow.proofs.search.chart` is η, not w.
-
-    Raises
-    ------
-    UnstableSurfaceError
-        When the surface is not locally stable.
+    ``motion``: the sliding dynamics. ``direction``: in y, (N,); on a surface y = (q_u, q̇_u, w), so
+    (1, 0, 0) is an angle at rest. ``degrees``: even degrees of the functions, one after the other;
+    the first V is quadratic. ``programs``: linear programs at most, shared by the degrees.
+    ``seconds``: process time at most, likewise. ``start``: the quadratic V to begin with: ``"far"``
+    reaches far along the direction and grows little; ``"round"`` starts closer and grows further;
+    ``"balanced"`` is for coordinates of very different sizes. ``slow``: on a surface with one
+    unactuated coordinate: whether the third of the coordinates of
+    :mod:`undertow.proofs.search.chart` is η, not w. Raises UnstableSurfaceError when the surface is
+    not locally stable.
     """
     rng = np.random.default_rng(seed)
     way = np.asarray(direction, dtype=float)
@@ -135,11 +120,7 @@ def search_region(
 
 
 def prove_region(
-    motion: SurfaceMotion,
-    direction: ArrayLike,
-    *,
-    seconds: float = math.inf,
-    seed: int = 0,
+    motion: SurfaceMotion, direction: ArrayLike, *, seconds: float = math.inf, seed: int = 0
 ) -> ProvedRegion:
     """Search for a region of attraction, prove it, and raise its level as far as that goes.
 

@@ -17,11 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from undertow.base.errors import ModelError
 from undertow.law import ProvedSet, ReachingLaw, Surface
 from undertow.models.mechanism import FloatArray, Mechanism
-from undertow.proofs.claims.terminal_ellipsoid import (
-    ClosedLoopProgram,
-    TerminalEllipsoid,
-    prove,
-)
+from undertow.proofs.claims.terminal_ellipsoid import ClosedLoopProgram, TerminalEllipsoid, prove
 from undertow.proofs.kernel.compiled import between
 
 #: Smallest semi-axes, relative to the largest, that are tried first.
@@ -38,18 +34,11 @@ EFFORT = 60
 class EllipsoidSearch:
     """Ellipsoids whose axes are the modes of one closed loop.
 
-    Parameters
-    ----------
-    margin
-        The kernel's margin of a candidate, at most 0 where it is not proved.
-    C, layer
-        s = C x, (m, 2n), and the half-widths of the layer, (m,).
-    T, T_inverse
-        Real modal matrix with columns of unit length, (2n, 2n), and its inverse.
-    rates
-        Decay rate of each column, (2n,), 1/s.
-    modes
-        The number of the mode of each column, (2n,): a complex pair shares one.
+    ``margin``: the kernel's margin of a candidate, at most 0 where it is not proved. ``C``,
+    ``layer``: s = C x, (m, 2n), and the half-widths of the layer, (m,). ``T``, ``T_inverse``: real
+    modal matrix with columns of unit length, (2n, 2n), and its inverse. ``rates``: decay rate of
+    each column, (2n,), 1/s. ``modes``: the number of the mode of each column, (2n,): a complex pair
+    shares one.
     """
 
     margin: Callable[[TerminalEllipsoid], float]
@@ -151,10 +140,7 @@ class EllipsoidSearch:
     def largest(self, rounds: int = 3) -> TerminalEllipsoid | None:
         """Return the proved terminal set with the largest ball that a short search finds.
 
-        Parameters
-        ----------
-        rounds
-            Rounds of the search for weights of the modes; 0 takes them all alike.
+        ``rounds``: rounds of the search for weights of the modes; 0 takes them all alike.
         """
         weights = np.zeros(self.modes[-1] + 1)
         radius = self._widest(weights, 0.01, 1.1)

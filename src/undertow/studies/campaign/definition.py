@@ -29,14 +29,9 @@ _NEEDED: Any = object()
 class Definition:
     """A campaign as data.
 
-    Parameters
-    ----------
-    mechanism
-        Its name, as for :func:`undertow.mechanisms.named.named`; paths are whole.
-    text
-        Everything else that the file says, as JSON.
-    code
-        Controllers of one's own that are entered, ``FILE.py:NAME`` with whole paths.
+    ``mechanism``: its name, as for :func:`undertow.mechanisms.named.named`; paths are whole.
+    ``text``: everything else that the file says, as JSON. ``code``: controllers of one's own that
+    are entered, ``FILE.py:NAME`` with whole paths.
     """
 
     mechanism: str
@@ -119,10 +114,7 @@ class Definition:
 def _of_data(name: str, definition: Path) -> str:
     """Return the whole name of a mechanism that a definition names; files may lie beside it.
 
-    Raises
-    ------
-    InvalidInputError
-        For one in a Python file.
+    Raises InvalidInputError for one in a Python file.
     """
     if in_a_file(name):
         raise InvalidInputError(

@@ -68,12 +68,8 @@ class ForfeitError(Exception):
 class Refereed:
     """An entrant in a run: its inputs are checked, its processor time is counted.
 
-    ``seconds`` has the processor time of every step, s.
-
-    Raises
-    ------
-    ForfeitError
-        When the entrant raises, or has not both methods of an :class:`Entrant`.
+    ``seconds`` has the processor time of every step, s. Raises ForfeitError when the entrant
+    raises, or has not both methods of an :class:`Entrant`.
     """
 
     def __init__(self, entrant: Entrant, x0: FloatArray, m: int) -> None:
@@ -91,10 +87,7 @@ class Refereed:
     def __call__(self, t: float, x: FloatArray) -> FloatArray:
         """Return the input at (t, x).
 
-        Raises
-        ------
-        ForfeitError
-            When the entrant raises, or its answer is no input.
+        Raises ForfeitError when the entrant raises, or its answer is no input.
         """
         began = time.process_time()
         answer = self._call(self.entrant.step, t, x.copy())
@@ -181,10 +174,7 @@ class Entry:
     def of(cls, name: str) -> Entry:
         """Return the entry of a name of the library, or of ``FILE.py:NAME``.
 
-        Raises
-        ------
-        InvalidInputError
-            When it cannot be called, or its settings are none.
+        Raises InvalidInputError when it cannot be called, or its settings are none.
         """
         if not in_a_file(name):
             return OURS[name]

@@ -46,19 +46,11 @@ Proved = LyapunovFunction | TerminalEllipsoid
 def picture(campaign: Campaign, proved: Proved | None = None) -> Figure:
     """Return the maps of a campaign's store; white is what is not computed yet.
 
-    Parameters
-    ----------
-    campaign
-        Over two axes, or a region over three.
-    proved
-        A proved set of the sliding motion, drawn into a region of states on its surface; or a
-        proved terminal set, which is too small for a map and is drawn larger, beside its place.
-
-    Raises
-    ------
-    InvalidInputError
-        For other numbers of axes, a set of the sliding motion where the states are not on a
-        surface, and a terminal set where those that stay as they are are not at the target.
+    ``campaign``: over two axes, or a region over three. ``proved``: a proved set of the sliding
+    motion, drawn into a region of states on its surface; or a proved terminal set, which is too
+    small for a map and is drawn larger, beside its place. Raises InvalidInputError for other
+    numbers of axes, a set of the sliding motion where the states are not on a surface, and a
+    terminal set where those that stay as they are are not at the target.
     """
     study: Any = campaign.study
     data = loaded(campaign.path, campaign.dataset().isel({
@@ -100,10 +92,8 @@ def picture(campaign: Campaign, proved: Proved | None = None) -> Figure:
 def picture_file(campaign: Campaign, proof: Path | None = None) -> tuple[bytes, list[str]]:
     """Return :func:`picture` as PNG, and what is to be said of the region of a certificate.
 
-    Raises
-    ------
-    InvalidInputError, ArtefactError, CertificateError
-        As for :func:`picture` and :func:`proved_set`.
+    Raises InvalidInputError, ArtefactError or CertificateError as for :func:`picture` and
+    :func:`proved_set`.
     """
     if proof is None:
         return figure_bytes(picture(campaign)), []
@@ -214,14 +204,9 @@ def proved_set(study: RegionMap, path: Path) -> Proved:
     """Return what a certificate states of the study's mechanism and law.
 
     For states on the surface that is a region on it, else a terminal set.  It is not decided again
-    here: ``undertow verify`` does.
-
-    Raises
-    ------
-    InvalidInputError
-        When it states none of this surface, or of this law.
-    ArtefactError, CertificateError
-        When it cannot be read, or is about another mechanism.
+    here: ``undertow verify`` does. Raises InvalidInputError when it states none of this surface, or
+    of this law; ArtefactError or CertificateError when it cannot be read, or is about another
+    mechanism.
     """
     certificate = read_certificate(path)
     wanted = study.surface.vector

@@ -64,10 +64,7 @@ _BUILDING, _COMPUTING = threading.RLock(), threading.Lock()
 def study_of(definition: Definition) -> Study:
     """Return the study that a definition means; the same object as long as it is in use.
 
-    Raises
-    ------
-    InvalidInputError
-        For a setting that is unknown or out of bounds.
+    Raises InvalidInputError for a setting that is unknown or out of bounds.
     """
     with _BUILDING:
         settings = definition.settings
@@ -171,12 +168,7 @@ class CampaignResult:
 class Campaign:
     """A definition and its store.
 
-    Parameters
-    ----------
-    definition
-        What is computed.
-    path
-        Folder of the store.
+    ``definition``: what is computed. ``path``: folder of the store.
     """
 
     def __init__(self, definition: Definition, path: Path) -> None:

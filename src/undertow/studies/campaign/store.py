@@ -269,10 +269,7 @@ def dataset(path: Path) -> Any:
 def loaded(path: Path, data: Any) -> Any:
     """Return what was opened of a store, read into memory.
 
-    Raises
-    ------
-    ArtefactError
-        Where a chunk is damaged.
+    Raises ArtefactError where a chunk is damaged.
     """
     try:
         return data.load()

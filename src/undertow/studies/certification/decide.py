@@ -305,10 +305,7 @@ def _sampled(loop: ClosedLoop, surface: Surface, start: FloatArray) -> list[Verd
 
 
 def certify_run(
-    mechanism: Mechanism,
-    run: Run,
-    *,
-    progress: Progress = no_progress,
+    mechanism: Mechanism, run: Run, *, progress: Progress = no_progress
 ) -> tuple[Certified, ...]:
     """Decide stability and a terminal set for every surface that a run applied, in order.
 

@@ -61,7 +61,6 @@ def region_figure(region: ProvedRegion, reaching: ReachingLaw, title: str) -> Fi
         What stands above.
     """
     motion = region.motion
-    assert isinstance(motion, SurfaceMotion)
     free = motion.mechanism.n - motion.mechanism.m
     loop = ClosedLoop(motion.mechanism, MinimumTime(horizon=LONGEST), reaching=reaching)
     given = ", ".join(f"{i.limit:g} {i.unit}" for i in motion.mechanism.inputs)
@@ -86,7 +85,6 @@ def region_figure(region: ProvedRegion, reaching: ReachingLaw, title: str) -> Fi
 def _slice(axes: Axes, region: ProvedRegion, loop: ClosedLoop, other: int) -> None:
     """Draw the plane of coordinates 0 and ``other``."""
     motion = region.motion
-    assert isinstance(motion, SurfaceMotion)
     surface = motion.surface
 
     def home(y: FloatArray) -> NDArray[np.bool_]:
@@ -105,8 +103,7 @@ def _slice(axes: Axes, region: ProvedRegion, loop: ClosedLoop, other: int) -> No
         level = region.level(grid)
     inside = np.where(np.isfinite(level), level, 2.0)
     spare = held(motion, grid)
-    side = np.sign(float(motion.determinant(np.zeros(motion.size))))
-    ratio = side * motion.determinant(grid)
+    ratio = motion.margin(grid)
     (fa, ua), (fb, ub) = _units(motion, 0), _units(motion, other)
     a, b = fa * grid[0, :, 0], fb * grid[:, 0, other]
     sky, blue = (to_rgba(COLOURS[c], part) for c, part in (("sky", 0.28), ("blue", 0.55)))
@@ -147,13 +144,11 @@ def _extents(
 ) -> tuple[float, float]:
     """Half-sides of the picture: what comes home, with room around; at most 3 × what is proved."""
     motion = region.motion
-    assert isinstance(motion, SurfaceMotion)
     reach = np.array([_first(region, 0), _first(region, other)])
     far = np.linspace(0.0, 4.0 * reach[0], 2001)
     line = np.zeros((len(far), motion.size))
     line[:, 0] = far
-    side = np.sign(float(motion.determinant(np.zeros(motion.size))))
-    singular = far[side * motion.determinant(line) <= 0]
+    singular = far[motion.margin(line) <= 0]
     widest = singular[0] if len(singular) else 2.5 * reach[0]
     sides = np.array([max(float(widest), reach[0]), 3.0 * reach[1]])
     for _ in range(8):
@@ -172,7 +167,6 @@ def _extents(
 def _edge(region: ProvedRegion, other: int) -> FloatArray:
     """Points just inside what is proved and kept, in directions spread evenly, (DRAWN, N)."""
     motion = region.motion
-    assert isinstance(motion, SurfaceMotion)
     size = np.array([_first(region, 0), _first(region, other)])
     angles = 2 * np.pi * (np.arange(DRAWN) + 0.5) / DRAWN
     rays = np.zeros((DRAWN, motion.size))

@@ -99,12 +99,7 @@ def certify(
 class Verification:
     """The claims of a certificate, each decided again; true if all of them hold.
 
-    Attributes
-    ----------
-    name
-        The mechanism's.
-    checked
-        In the order of the file.
+    ``name``: the mechanism's. ``checked``: in the order of the file.
     """
 
     name: str
@@ -131,10 +126,7 @@ class Verification:
 
 @checked
 def verify(
-    certificate: Certificate | str | Path,
-    mechanism: Mechanism,
-    *,
-    progress: Progress | None = None,
+    certificate: Certificate | str | Path, mechanism: Mechanism, *, progress: Progress | None = None
 ) -> Verification:
     """Decide every claim of a certificate again, for a mechanism with its own parameters.
 

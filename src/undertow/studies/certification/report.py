@@ -165,9 +165,7 @@ def verification_report(certificate: Certificate, checked: Sequence[Checked]) ->
 
 
 def certificate_files(
-    mechanism: Mechanism,
-    certified: Sequence[Certified],
-    figures: Mapping[str, bytes] | None = None,
+    mechanism: Mechanism, certified: Sequence[Certified], figures: Mapping[str, bytes] | None = None
 ) -> dict[str, bytes]:
     """Return the files: ``certificate.json``, where a claim is proved, and the figures."""
     certificate = Certificate.of(mechanism, [c.subject for c in certified], results.versions())

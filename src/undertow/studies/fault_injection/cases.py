@@ -163,8 +163,7 @@ class OutputMonitor(RigWrapper):
                 self.faults.append(f"past its limits: {u.tolist()}")
             elif (np.abs(u - self.last) > self.slew * (1.0 + 1e-9)).any():
                 self.faults.append(f"faster than its slew: {self.last.tolist()} to {u.tolist()}")
-        part = np.abs(u) / np.where(np.isfinite(self.limits), self.limits, math.inf)
-        self.largest = max(self.largest, float(np.max(part)))
+        self.largest = max(self.largest, float(np.max(np.abs(u) / self.limits)))
         self.last = u.copy()
         self.rig.write(u)
 
@@ -173,30 +172,14 @@ class OutputMonitor(RigWrapper):
 class Case:
     """One fault of the drill.
 
-    Parameters
-    ----------
-    part
-        What fails.
-    name
-        How.
-    holds
-        Whether the mechanism can still be held; otherwise the run must stop safely.
-    optimiser, answers, sensor, actuator, hang, estimator
-        What happens, at which seam.
-    silent
-        The optimiser answers no more.
-    push
-        Impulse on the last coordinate, N m s or N s.
-    slow
-        How long each read takes from then on, s.
-    operator, disk_full
-        The operator stops the run; the disk takes no more of the log.
-    since
-        When the fault begins, s, if not with the others.
-    ends
-        How the run may end; by default balanced or caught where it holds, else stopped or lost.
-    off
-        Whether the device can take an output of zero at the end.
+    ``part``: what fails. ``name``: how. ``holds``: whether the mechanism can still be held;
+    otherwise the run must stop safely. ``optimiser``, ``answers``, ``sensor``, ``actuator``,
+    ``hang``, ``estimator``: what happens, at which seam. ``silent``: the optimiser answers no more.
+    ``push``: impulse on the last coordinate, N m s or N s. ``slow``: how long each read takes from
+    then on, s. ``operator``, ``disk_full``: the operator stops the run; the disk takes no more of
+    the log. ``since``: when the fault begins, s, if not with the others. ``ends``: how the run may
+    end; by default balanced or caught where it holds, else stopped or lost. ``off``: whether the
+    device can take an output of zero at the end.
     """
 
     part: str

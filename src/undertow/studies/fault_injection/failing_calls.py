@@ -63,10 +63,7 @@ class Fault:
     def parse(cls, text: str) -> Self:
         """Return the fault that is written as ``write:17:always:ideal``.
 
-        Raises
-        ------
-        InvalidInputError
-            When it is none.
+        Raises InvalidInputError when it is none.
         """
         parts = text.split(":")
         right = len(parts) == 4 and parts[0] in OPERATIONS and parts[1].isdecimal()
@@ -83,10 +80,7 @@ class Fault:
 class Tally:
     """Counts calls in memory that forked processes share, and knows whose turn it is to fail.
 
-    Attributes
-    ----------
-    counts
-        Calls of each of :data:`OPERATIONS` so far.
+    ``counts``: calls of each of :data:`OPERATIONS` so far.
     """
 
     def __init__(self, fault: Fault | None = None) -> None:
@@ -106,10 +100,7 @@ class Tally:
     def check(self, operation: str) -> None:
         """Count a call, and raise if it is to fail.
 
-        Raises
-        ------
-        OSError
-            When it is.
+        Raises OSError when it is.
         """
         if self.due(operation):
             raise OSError(errno.EIO, f"{operation} {int(self.counts[_PLACES[operation]])} fails")

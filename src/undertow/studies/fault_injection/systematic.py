@@ -30,14 +30,7 @@ from types import FrameType
 
 import numpy as np
 
-from undertow.base import (
-    Progress,
-    UndertowError,
-    each,
-    error_text,
-    no_progress,
-    require,
-)
+from undertow.base import Progress, UndertowError, each, error_text, no_progress, require
 from undertow.cascade import CascadeState
 from undertow.models import FloatArray
 from undertow.plants import Measurement, Rig, RigWrapper
@@ -202,10 +195,7 @@ class _Run:
 class Systematic:
     """Runs with one fault each, on two rigs; what they share is computed once.
 
-    Parameters
-    ----------
-    seed
-        Of the rig and of the optimiser.
+    ``seed``: of the rig and of the optimiser.
     """
 
     def __init__(self, seed: int = 0) -> None:
@@ -256,10 +246,7 @@ class Systematic:
     def run(self, fault: Fault) -> FaultResult:
         """Make one run with a fault, and judge it.
 
-        Raises
-        ------
-        InvalidInputError
-            For a rig that there is none of.
+        Raises InvalidInputError for a rig that there is none of.
         """
         require(fault.rig in RIGS, "rig of a fault", fault.rig, " or ".join(RIGS))
         tally, before = Tally(fault), _running()

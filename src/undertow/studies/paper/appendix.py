@@ -45,10 +45,7 @@ BITS = 200
 def flint() -> Any:
     """Return the module python-flint.
 
-    Raises
-    ------
-    MissingExtraError
-        When it is not installed.
+    Raises MissingExtraError when it is not installed.
     """
     return require_extra("flint", "appendix", "ball arithmetic needs python-flint")
 
@@ -157,10 +154,7 @@ CASES: tuple[AppendixCase, ...] = (
 class Reduced:
     """The reduced system (A14)-(A16), corrected, with exact coefficients.
 
-    Raises
-    ------
-    InvalidInputError
-        When ε is not in (0, 1), (A13), or λ_a = 0.
+    Raises InvalidInputError when ε is not in (0, 1), (A13), or λ_a = 0.
     """
 
     alpha_a: Fraction
@@ -329,16 +323,9 @@ def _proved_smallest(R: tuple[Matrix, Matrix], vertices: Sequence[Any]) -> float
 def two_vertex(reduced: Reduced, P: Lyapunov, half_width: float | Fraction) -> Verdict:
     """Decide P ≻ 0 and R(y₁) ≻ 0 for all |y₁| ≤ half_width, exactly.
 
-    Parameters
-    ----------
-    half_width
-        Half-width of Ĩ, rad, ≥ 0; a fraction or float is taken as it is.
-
-    Returns
-    -------
-    Verdict
-        ``margin``: a proved lower bound of inf λ_min(R) over the interval; ``refuted``:
-        the witness is an angle (and, within R, a direction) where it fails.
+    ``half_width``: half-width of Ĩ, rad, ≥ 0; a fraction or float is taken as it is. The
+    margin is a proved lower bound of inf λ_min(R) over the interval; a refutation's witness is an
+    angle (and, within R, a direction) where it fails.
     """
     width = float(half_width)
     require(width >= 0, "half-width of Ĩ", width, "≥ 0 rad")

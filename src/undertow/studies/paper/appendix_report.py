@@ -185,7 +185,4 @@ def files() -> dict[str, bytes]:
     MissingExtraError
         Where ``undertow[appendix]`` is not installed.
     """
-    return {
-        "appendix.md": markdown().encode(),
-        **figure_files(figures(), ("png", "pdf")),
-    }
+    return {"appendix.md": markdown().encode(), **figure_files(figures(), ("png", "pdf"))}

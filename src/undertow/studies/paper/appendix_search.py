@@ -107,16 +107,10 @@ TOLERANCE = 1e-3
 def search_rate(reduced: Reduced, half_width: float | Fraction) -> tuple[Lyapunov, Verdict]:
     """Find the P of form (A18) with the largest proved decay rate on |y₁| ≤ half_width.
 
-    For each σ a semidefinite program at the two vertices (γ is linear in p₂₂); bisection
-    on σ below twice the slowest rate of the linearisation; each P is rounded to 12 digits
-    and its rate is then proved by :func:`decay_rate`.
-
-    Raises
-    ------
-    InfeasibleError
-        When no P serves.
-    MissingExtraError
-        Without Clarabel or python-flint.
+    For each σ a semidefinite program at the two vertices (γ is linear in p₂₂); bisection on σ below
+    twice the slowest rate of the linearisation; each P is rounded to 12 digits and its rate is then
+    proved by :func:`decay_rate`. Raises InfeasibleError when no P serves; MissingExtraError without
+    Clarabel or python-flint.
     """
     low, high = 0.0, 2 * reduced.slowest_rate
     best: tuple[Lyapunov, Verdict] | None = None
@@ -144,15 +138,8 @@ def search_rate(reduced: Reduced, half_width: float | Fraction) -> tuple[Lyapuno
 def search_interval(reduced: Reduced) -> tuple[float, Lyapunov, Verdict]:
     """Find the P of form (A18) with R ≻ 0 on the widest interval, by bisection.
 
-    Returns
-    -------
-    half_width, P, verdict
-        The widest proved half-width, to :data:`TOLERANCE` of arccos ε.
-
-    Raises
-    ------
-    InfeasibleError
-        When no P serves even at y₁ = 0.
+    Returns the widest proved half-width, to :data:`TOLERANCE` of arccos ε. Raises InfeasibleError
+    when no P serves even at y₁ = 0.
     """
 
     def attempt(width: float) -> tuple[Lyapunov, Verdict] | None:

@@ -64,10 +64,7 @@ def repeats_figure(repeats: Repeats) -> Figure:
 
 
 def comparison(
-    columns: Mapping[str, Mapping[str, Trajectory]],
-    *,
-    until: tuple[float, float],
-    title: str = "",
+    columns: Mapping[str, Mapping[str, Trajectory]], *, until: tuple[float, float], title: str = ""
 ) -> Figure:
     """Return Figure 4 or 6: base, one-time and cascade; φ, θ and voltage.
 

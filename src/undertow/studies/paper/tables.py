@@ -239,11 +239,7 @@ def report(result: Reproduction) -> RenderableType:
     """Return the whole report for the terminal."""
     parts: list[RenderableType] = []
     for objective, title in TITLES.items():
-        parts += [
-            Text(title, style="bold"),
-            _tables(result, objective),
-            "",
-        ]
+        parts += [Text(title, style="bold"), _tables(result, objective), ""]
     parts.append(Text(CAPTION, style="dim"))
     told = findings(result)
     sections = {

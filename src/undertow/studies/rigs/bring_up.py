@@ -39,14 +39,8 @@ def rig_in_the_class(
 ) -> tuple[Mechanism, RealisticRig, dict[str, float]]:
     """Return a belief, a rig that the wizard's model class contains, and what is true of it.
 
-    Counted and noisy positions, dry friction, a delay, and parameters up to 10 % off.
-
-    Parameters
-    ----------
-    seed
-        Of parameters, noise and encoder zeros.
-    noise
-        Of the positions, rad.
+    Counted and noisy positions, dry friction, a delay, and parameters up to 10 % off. ``seed``: of
+    parameters, noise and encoder zeros. ``noise``: of the positions, rad.
     """
     rng = np.random.default_rng([seed, 7])
     belief = rotary_pendulum()

@@ -226,12 +226,8 @@ def measure(
 ) -> list[ExportRow]:
     """Build, test, compare and count each controller in a folder that is then removed.
 
-    ``states`` random ones are compared with Python; the compiler takes GCC's options.
-
-    Raises
-    ------
-    MissingExtraError
-        When the compiler, ``size``, ``nm`` or ``valgrind`` is not installed.
+    ``states`` random ones are compared with Python; the compiler takes GCC's options. Raises
+    MissingExtraError when the compiler, ``size``, ``nm`` or ``valgrind`` is not installed.
     """
     entries = []
     for controller in each(controllers, progress, lambda one: one.mechanism.name):

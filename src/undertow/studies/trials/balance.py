@@ -36,12 +36,7 @@ CAUGHT = 5.0
 
 
 def controllers(
-    belief: Mechanism,
-    bench: Bench,
-    objective: Objective,
-    x0: FloatArray,
-    *,
-    budget: int = 256,
+    belief: Mechanism, bench: Bench, objective: Objective, x0: FloatArray, *, budget: int = 256
 ) -> dict[str, MakeController]:
     """Return the three controllers of the paper's tables, by name.
 

@@ -70,12 +70,8 @@ def nmpc(mechanism: Mechanism, objective: Objective, **settings: Any) -> MakeCon
 class Comparison:
     """Outcomes by (controller, plant).
 
-    Attributes
-    ----------
-    outcomes
-        Names of controller and plant to the run.
-    cost_unit
-        Unit of the outcomes' cost.
+    ``outcomes``: names of controller and plant to the run. ``cost_unit``: unit of the outcomes'
+    cost.
     """
 
     outcomes: Mapping[tuple[str, str], Outcome]
