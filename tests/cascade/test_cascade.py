@@ -451,6 +451,11 @@ def test_what_is_no_planner_or_no_verdict_of_a_gate_is_refused(rig: ut.Mechanism
     """By name, and not as a missing attribute of None after the first search."""
     with pytest.raises(InvalidInputError, match=r"planner of the cascade.*the method propose"):
         ut.Cascade(rig, planner=lambda _x: None)  # type: ignore[arg-type]
+    wordless = ut.Cascade(rig, planner=SimpleNamespace(propose=lambda *_, **__: None))
+    with pytest.raises(
+        InvalidInputError, match=r"planner: got a NoneType, must be an undertow\.Proposal"
+    ):
+        wordless.simulate(phi=0.1)
     silent: Any = lambda *_: None  # noqa: E731
     cascade = ut.Cascade(rig, ut.MinimumTime(), belief="exact", gate=silent, cold=Budget(32))
     with pytest.raises(InvalidInputError, match=r"gate of the cascade returned.*None.*Admission"):

@@ -172,7 +172,12 @@ def test_version_and_bare_call() -> None:
         ),
         (("optimise", RIG, "--evaluations", "0"), "0 evaluations", "at least 1"),
         (("simulate", CRANE, "--target", "x=2m"), "x = 2 m", "95 % of the travel"),
-        (("simulate", CRANE, "--target", "x=2"), "'2'", "a number with its unit, m"),
+        (
+            ("simulate", CRANE, "--target", "x=2"),
+            "'2'",
+            "a number with its unit, m. Write for instance --target x=2m",
+        ),
+        (("simulate", RIG, "--start", "phi=20"), "'20'", "for instance --start phi=20deg"),
         (("simulate", CRANE, "--target", "x=1m@2min"), "'2min'", "s or Hz"),
         (("simulate", CRANE, "--target", "x_dot=1m/s"), "x_dot = 1", "velocity 0"),
         (("simulate", CRANE, "--target", "theta=5deg"), "theta = 0.0872665", "along x"),
@@ -294,7 +299,7 @@ def test_a_path_may_have_an_equals_sign(tmp_path: Path) -> None:
 def test_start_without_unit_is_told_what_to_write() -> None:
     """The remedy is a word that can be pasted."""
     _, _, err = run("simulate", RIG, "--start", "phi=40")
-    assert "--start phi=10deg" in err
+    assert "--start phi=40deg" in err
 
 
 def test_unknown_option_and_choice_exit_2() -> None:

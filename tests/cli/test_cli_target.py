@@ -62,7 +62,7 @@ def test_what_is_typed_reaches_the_run_and_what_it_says_the_person(tmp_path: Pat
         assert "error: target: got x = 2 m, must be x ≤ 1 m. Try 1 m" in err
         code, out, err = run("target", str(log), "x=2")
         assert (code, out) == (2, "")
-        assert "a number with its unit, m. Write for instance x=1m" in err
+        assert "a number with its unit, m. Write for instance x=2m" in err
     code, out, err = run("target", str(log), "x=0.25m")
     assert (code, out) == (1, "")
     assert "no such log" in err

@@ -24,7 +24,7 @@ from support import (
     runge_kutta,
 )
 from undertow.base import InvalidInputError
-from undertow.closed_loop import INADMISSIBLE, UNSTABLE, Event, simulate_along
+from undertow.closed_loop import INADMISSIBLE, UNSTABLE, Event, RolloutBuffers, simulate_along
 from undertow.closed_loop.trajectory import PENALTY, Batch
 from undertow.law import Plan
 from undertow.models import TIME, FloatArray
@@ -769,8 +769,11 @@ def test_gains_that_the_step_cannot_follow_are_refused_or_switched_off(
         worst = int(np.argmax(each))
         assert found.event[worst] == Event.UNSTABLE
         assert found.event[1 - worst] == Event.HORIZON
+        buffers = RolloutBuffers(slow, 2, 1).fill(x0, np.array([[quick.vector], [base.vector]]))
+        searched = interpreted(slow).roll_out(buffers, (0.0,), slow.step)
+        assert searched.event.tolist() == found.event.tolist()  # a search goes on with the others
     sign = ut.ClosedLoop(believed, step=1.0, reaching=ut.ReachingLaw(switching="sign"))
-    sign._check_gains(np.empty((1, 1, 7)), np.ones(1), stable_only=False)  # no layer, no limit
+    assert not sign._fastest(np.empty((1, 1, 7))).any()  # no layer, no limit
 
 
 def test_a_step_may_be_as_long_as_the_layer_bears(rig: ut.Mechanism) -> None:
@@ -805,6 +808,21 @@ def test_the_usual_values_are_the_documented_ones(
     for radius, event in ((199.0, Event.HORIZON), (201.0, Event.DIVERGED)):
         far = loop.batch(rig.state(theta=radius), ut.Surface(-1, -1e-9, 0, 1), duration=0.002)
         assert far.event[0] == event
+
+
+def test_a_motion_goes_on_where_learnt_parameters_raise_the_gains_beyond_the_step(
+    rig: ut.Mechanism, quick: ut.Surface
+) -> None:
+    """What was looked at with the parameters that were given is not refused in its midst."""
+    believed, x0 = rig.with_disturbance_bounds(2.0, 0.01), rig.state(phi=0.1)
+    gains = ut.SlidingModeLaw(believed, quick)(0.0, np.zeros(4)).gains[0]
+    loop = ut.ClosedLoop(believed, step=0.999 * 2 * 0.1 / gains)
+    learnt = loop.believing(believed.with_parameters(m=0.1))
+    assert learnt._fastest(RolloutBuffers(learnt, 1, 1).fill(x0, quick.vector).lanes)[0] > 2
+    assert learnt.batch(x0, quick).event[0] == Event.UNSTABLE  # no plan to be chosen
+    motion = learnt.simulate(x0, quick, duration=5 * loop.step)
+    assert motion.event == Event.HORIZON
+    assert np.isfinite(motion.x).all()
 
 
 def refusals(rig: ut.Mechanism, s: ut.Surface) -> dict[str, tuple[Callable[[], object], str]]:

@@ -243,3 +243,18 @@ def test_symbols_of_the_theory_step_aside_for_those_of_the_mechanism() -> None:
                 assert sp.expand(sp.sympify(wanted).xreplace(rename) - found) == 0
     assert "α_u'" in odd.text()
     assert r"\alpha_{u'}" in odd.latex()
+
+
+def test_greek_names_and_bare_numbers_are_written_down() -> None:
+    """LaTeX knows no φ in formulas; a number that stands alone has the digits that it was given."""
+    push, lean = ut.Coordinate("δ_1", "m"), ut.Coordinate("φ", "rad")
+    v, w = push.velocity, lean.velocity
+    pole = ut.Mechanism.from_energies(
+        "pole", [push, lean], [ut.Input("F", "N", 10.0)],
+        kinetic=0.85 * v**2 / 2 + 0.1 * sp.cos(lean.symbol) * v * w + w**2 / 2,
+        potential=sp.cos(lean.symbol),
+    )  # fmt: skip
+    shown = ut.derivation(pole)
+    assert shown.latex().isascii()
+    assert r"\dot{\delta}_{1}" in shown.latex()
+    assert "M₁₁ = 0.85\n" in shown.text()

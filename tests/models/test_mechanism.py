@@ -549,7 +549,7 @@ def test_what_rests_at_its_target_is_a_matter_of_no_scale(mass: float, length: f
     ]
 
 
-@pytest.mark.parametrize("unit", [1.0, 1e-6, 1e6])
+@pytest.mark.parametrize("unit", [1.0, 1e-6, 1e6, 1e-200, 1e200])
 def test_how_controllable_a_mechanism_is_does_not_depend_on_the_unit_of_its_input(
     unit: float,
 ) -> None:

@@ -65,6 +65,8 @@ def test_an_elbow_torque_in_absolute_angles() -> None:
         "arm", q, [ut.Input("torque", "N m", 30.0)], T, V, sp.Matrix([-1, 1]), dissipation=D
     )
     assert [c.name for c in arm.coordinates] == ["lean_2_minus_lean_1", "lean_1"]
+    with pytest.raises(InvalidInputError, match="lean_2_minus_lean_1 is lean_2 - lean_1"):
+        arm.state(lean_2_dot=0.1)  # what was given in its place is told
     assert_same(arm, ut.mechanisms.acrobot())
     assert check_mechanism(arm, compiled=False).passed
 

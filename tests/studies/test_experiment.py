@@ -130,7 +130,7 @@ def test_an_interrupted_experiment_goes_on_where_it_ended(tmp_path: Path) -> Non
     second = squares(6, made)
     result = second.run(second.ledger(tmp_path), progress=lambda *words: told.append(words))
     assert made == [3, 4, 5]
-    assert told == [("square", 3 / 6), ("square", 4 / 6), ("square", 5 / 6)]
+    assert told == [(f"square ({k + 1} of 6)", k / 6) for k in (3, 4, 5)]
     assert result == squares(6, []).run() == {"square": [0.0, 1.0, math.inf, 9.0, 16.0, 25.0]}
     other = Experiment("squares", second.line, second.tasks, {"a": 2}, second.report)
     with pytest.raises(ArtefactError, match="other versions or settings"):
@@ -145,7 +145,7 @@ def test_progress_of_tasks_that_have_only_numbers_names_the_experiment() -> None
         "coverage", tuple[float, int, float], tasks, {}, lambda _: []
     )
     work.run(progress=lambda *words: told.append(words))
-    assert told == [("coverage", 0.0), ("coverage", 0.5)]
+    assert told == [("coverage (1 of 2)", 0.0), ("coverage (2 of 2)", 0.5)]
 
 
 def test_what_was_finished_before_a_task_failed_is_kept(tmp_path: Path) -> None:

@@ -171,6 +171,38 @@ def test_plants_with_the_same_sensors_share_one_search(
     assert len(searched) == 3
 
 
+def test_a_law_in_the_place_of_what_makes_one_is_refused_at_once(arm: ut.Mechanism) -> None:
+    def law(t: float, x: FloatArray) -> FloatArray:
+        return np.zeros(1)
+
+    for wrong, got in (
+        (law, r"\(t: "),
+        (lambda start: [0.0], r"\[0.0\] when called"),
+        (max, "float"),
+    ):
+        with pytest.raises(
+            InvalidInputError, match=rf"of compare: got .*{got}.* lambda start: law"
+        ):
+            ut.compare(arm, [wrong], plants=[arm], seconds=0.01, phi=0.1)  # type: ignore[list-item]
+    made = ut.compare(arm, [lambda start: law], plants=[arm], seconds=0.01, phi=0.1)
+    assert len(made.rows) == 1
+
+
+def test_a_run_that_ends_before_its_arm_is_home_is_not_called_lost(arm: ut.Mechanism) -> None:
+    """Free coordinates home, the arm out and coming nearer: not yet; going away or still: no."""
+    t = np.arange(0.0, 4.0, 0.001)
+    for theta, lean, word in (
+        (0 * t, 0.0, "yes"), (0 * t, 0.2, "no"), (2 - 0.3 * t, 0.0, "not yet"),
+        (2 - 0.3 * t, 0.2, "no"), (1 + 0.3 * t, 0.0, "no"), (1 + 0 * t, 0.0, "no"),
+    ):  # fmt: skip
+        truth = np.zeros((len(t), 4))
+        truth[:, 0], truth[:, 1] = theta, lean
+        run = judge(arm, Record(t, truth[:, :2], truth, np.zeros((len(t), 1)), truth))
+        table = compare.Comparison({("law", "rig"): run})
+        assert table._cells()[1][2] == word
+        assert (compare.NOT_YET in str(table)) == (word == "not yet")
+
+
 def test_a_run_is_balanced_only_if_it_stays_so(arm: ut.Mechanism) -> None:
     t = np.arange(0.0, 4.0, 0.001)
 

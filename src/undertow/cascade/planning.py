@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import error_text
+from undertow.base import InvalidInputError, a_kind, error_text
 from undertow.cascade.judge import Judge
 from undertow.cascade.planners import Planners
 from undertow.cascade.predictions import costs_along
@@ -122,6 +122,13 @@ class Planning:
             else:
                 proposal = planner.propose(
                     x, incumbent=None, horizon=span, sequence=0, computed_for=t, resolution=0.0
+                )
+            if not isinstance(proposal, Proposal):  # a planner of one's own
+                raise InvalidInputError(
+                    "answer of the cascade's planner",
+                    value=a_kind(proposal),
+                    limit="an undertow.Proposal",
+                    remedy="undertow.Optimiser.propose shows what a proposal holds",
                 )
             plan = proposal.plan
             if plan is None:

@@ -171,7 +171,7 @@ def parse_values(
 
 def _units_of(mechanism: Mechanism, name: str, what: str) -> tuple[str, ...]:
     """Return the units in which a state may be typed."""
-    one_of(f"{what} of '{mechanism.name}'", name, mechanism.state_names)
+    mechanism.check_state_name(what, name)
     index = mechanism.state_names.index(name)
     return _units_like(mechanism.coordinates[index % mechanism.n].unit, rate=index >= mechanism.n)
 
@@ -203,6 +203,12 @@ def _quantity(text: str, units: Sequence[str], what: str, example: str) -> tuple
     return float(match[1]), match[2]
 
 
+def _bare(text: str, other: str) -> str:
+    """Return a number that was typed without its unit, to be shown with it; else another."""
+    match = _QUANTITY.fullmatch(text.strip())
+    return match[1] if match and not match[2] else other
+
+
 def parse_start(mechanism: Mechanism, words: Sequence[str] | None) -> FloatArray:
     """Read an initial state from ``name=value`` words with units; the rest is zero.
 
@@ -221,7 +227,7 @@ def parse_start(mechanism: Mechanism, words: Sequence[str] | None) -> FloatArray
     values: dict[str, float] = {}
     for name, text in _pairs(words, f"{mechanism.coordinates[-1].name}=40deg").items():
         units = _units_of(mechanism, name, "initial state")
-        example = f"--start {name}=10{units[0]}"
+        example = f"--start {name}={_bare(text, '10')}{units[0]}"
         number, unit = _quantity(text, units, f"initial state '{name}'", example)
         values[name] = number * UNITS[unit][2]
     return mechanism.state(**values)
@@ -298,7 +304,7 @@ def _target_of_words(
         name, text = _split(word, "x=1m")
         value, at, when = text.partition("@")
         units = units_of(name)
-        one = f"{option}{name}=1{units[0]}"
+        one = f"{option}{name}={_bare(value, '1')}{units[0]}"
         number, unit = _quantity(value, units, f"target '{name}'", one)
         example = f"{one}@2s or {one}@0.5Hz"
         time, kind = _quantity(when, ("s", "Hz"), f"target '{name}'", example) if at else (0.0, "s")

@@ -85,6 +85,9 @@ CALMER = 0.5
 #: dry friction moves more than noise did.
 NEAR = 0.25
 
+#: k/ε times the period of the law from which on it overshoots ever farther near the surface.
+OVERSHOOTS = 2.0
+
 #: Switch steps of a single surface.
 _AT_ONCE = np.zeros(1, dtype=np.int64)
 
@@ -176,6 +179,9 @@ class ClosedLoop:
     covariance: FloatArray | None = None
     threads: int = 1
     returning: bool = False
+
+    #: Whether its parameters are those that were given, not learnt ones.
+    _as_given = True
 
     def __post_init__(self) -> None:
         """Refuse steps that the boundary layer cannot bear and plants of another mechanism."""
@@ -320,6 +326,7 @@ class ClosedLoop:
         if self.plant is None and (self.ensemble is None) == (ensemble is None):
             end = self.linear_end and self.linear_end.believing(mechanism, ensemble)
         other = self._changed({"numbers", "linear_end"}, mechanism=mechanism, ensemble=ensemble)
+        other.__dict__["_as_given"] = False
         if end is not None:
             other.__dict__["linear_end"] = end
         return other
@@ -372,10 +379,12 @@ class ClosedLoop:
         every: int = 0,
         record: FloatArray = NOTHING,
         noise: FloatArray | None = None,
+        precise: bool = False,
     ) -> Batch:
         """Roll out what buffers hold; their numbers are not checked again.
 
-        This is what searches call thousands of times.
+        This is what searches call thousands of times: of what they propose, surfaces whose gains
+        (13) the step cannot follow are ``UNSTABLE``.
 
         Parameters
         ----------
@@ -389,7 +398,14 @@ class ClosedLoop:
             Where every so many steps leave a row, (N, rows, 2n + 2m + 2); 0: nowhere.
         noise
             Measurement noise, (samples, N, 2n).
+        precise
+            As for :meth:`batch`, where the loop :attr:`adapts`.
         """
+        if precise and self.adapts:
+            return self._follow(
+                buffers, switch_times, duration, start=start, terminal=terminal, cap=cap,
+                stable_only=stable_only, every=every, record=record, noise=noise,
+            )  # fmt: skip
         switches, steps, parts = (
             self._switch_steps(switch_times), self._steps(duration), self.substeps
         )  # fmt: skip
@@ -425,7 +441,8 @@ class ClosedLoop:
         while True:
             live, out = part.live, part.out
             goes_on = calm_from < steps
-            prepared = self._begun(part, stable_only, goes_on or (noisy and part is buffers))
+            linearised = goes_on or (noisy and part is buffers)
+            prepared = self._begun(part, stable_only, linearised, moves=every > 0)
             integrate = shared(self._kernels.rollout, self.threads, part.padded, steps)
             integrate(
                 0, part.padded, part.states, live, part.lanes, parts * switches, numbers.plant,
@@ -465,7 +482,7 @@ class ClosedLoop:
         """Do what :meth:`roll_out` does to the tolerance of the loop, motion by motion."""
         live, numbers, look = buffers.live, self.numbers, self._look
         noisy = self.covariance is not None and self.linear_end is not None
-        self._begun(buffers, stable_only, noisy)
+        self._begun(buffers, stable_only, noisy, moves=every > 0)
         m, nu = self.mechanism.m, self.objective.terminal_radius
         _, seen = self._looked(buffers.lanes[0, 0], np.zeros(2 * self.mechanism.n + 1), start)
         least = -ALLOWED * np.maximum(np.nan_to_num(seen[2 * m :]), 0.0)
@@ -520,15 +537,18 @@ class ClosedLoop:
         return (rate if 0.0 < rate < math.inf else 1.0) / np.fmax(room, LEAST_ROOM)
 
     def _begun(
-        self, buffers: RolloutBuffers, stable_only: bool, linearised: bool
+        self, buffers: RolloutBuffers, stable_only: bool, linearised: bool, *, moves: bool
     ) -> Prepared | None:
         """Switch lanes on, but for those that are ruled out; linearise the last surface of each.
 
-        The latter where that is asked for, or where it tells which lanes are stable.
+        Ruled out are gains (13) that this step cannot follow, unless the motion is one that is
+        under way and ``moves`` with them all the same.  Linearised is where that is asked
+        for, or where it tells which lanes are stable.
         """
         live = buffers.live
         live.fill(1.0)
-        self._check_gains(buffers.lanes, live, stable_only)
+        if not moves:
+            live[self._fastest(buffers.lanes) >= OVERSHOOTS] = 0.0
         needless = not (linearised or stable_only)
         if needless or self.linear_end is None or buffers.ends is None:
             return None
@@ -541,25 +561,41 @@ class ClosedLoop:
             live *= buffers.ends.stable
         return buffers.ends
 
-    def _check_gains(self, lanes: FloatArray, live: FloatArray, stable_only: bool) -> None:
-        """Refuse gains (13) that this step cannot follow, or switch their lanes off."""
+    def _fastest(self, lanes: FloatArray) -> FloatArray:
+        """Fastest k/ε that the gains (13) ask for near the target, times the period: (N,).
+
+        From 2 on the law, renewed once a period, overshoots ever farther; zero where η and ε
+        alone, which were looked at before, say how fast it is.
+        """
         if not (self.reaching.has_layer and any(self.mechanism.disturbance_bounds)):
-            return
+            return np.zeros(len(lanes))
         layout = LawLayout(self.mechanism.n, self.mechanism.m)
         flat = lanes.reshape(-1, lanes.shape[-1])
         gains = gains_at_target(self.mechanism, flat[:, layout.surface], flat[:, layout.eta])
         rate = (gains / flat[:, layout.layer]).max(axis=1).reshape(lanes.shape[:2]).max(axis=1)
-        period = self.step * max(1, self.zoh_steps)
-        fast = rate * period >= 2.0
-        if stable_only:
-            live[fast] = 0.0
-        elif fast.any():
+        return np.asarray(rate * self._period)
+
+    @property
+    def _period(self) -> float:
+        """How often the law is renewed, s."""
+        return self.step * max(1, self.zoh_steps)
+
+    def _check_gains(self, buffers: RolloutBuffers) -> None:
+        """Refuse gains (13) that this step cannot follow, but for those of other parameters.
+
+        Where parameters are learnt, those of a plan that goes on may become a little larger.
+        """
+        fastest = float(self._fastest(buffers.lanes).max()) if self._as_given else 0.0
+        if fastest >= OVERSHOOTS:
+            rate = fastest / self._period
             raise InvalidInputError(
                 "step for the gains (13) that the disturbance bounds ask for",
-                value=f"{period:g} s at k/ε = {rate.max():.4g} 1/s",
-                limit=f"below 2 ε/k = {2 / rate.max():.3g} s",
-                remedy="Use a shorter step, a thicker boundary layer or smaller bounds; a file's "
-                "dry friction in joints without a motor is a bound, too",
+                value=f"{self._period:g} s at k/ε = {rate:.4g} 1/s",
+                limit=f"below {OVERSHOOTS:g} ε/k = {OVERSHOOTS / rate:.3g} s",
+                remedy="Use a boundary layer more than "
+                f"{fastest / OVERSHOOTS:.3g} times as thick, reaching=undertow.ReachingLaw"
+                "(layer=...), a shorter step or smaller bounds; dry friction in a model file is "
+                "such a bound",
             )
 
     @checked
@@ -657,14 +693,18 @@ class ClosedLoop:
                 limit="one of them",
                 remedy="Look for the closest approach in the steps of the loop",
             )
-        precise = precise and self.adapts
-        return (self._follow if precise else partial(self.roll_out, seek=seek))(
-            RolloutBuffers(self, count, len(switch_times)).fill(states, vectors, reaching),
+        buffers = RolloutBuffers(self, count, len(switch_times)).fill(states, vectors, reaching)
+        if not stable_only:
+            self._check_gains(buffers)
+        return self.roll_out(
+            buffers,
             switch_times,
             self.objective.horizon if duration is None else duration,
             terminal=terminal,
             cap=cap,
             stable_only=stable_only,
+            seek=seek,
+            precise=precise,
         )
 
     @property
@@ -746,8 +786,9 @@ class ClosedLoop:
             )  # fmt: skip
         buffers = RolloutBuffers(self, 1, len(plan.times))
         record = self._record(buffers, -(-self.equal_steps(span)[0] // every))
-        batch = (self._follow if self.adapts else self.roll_out)(
-            buffers.fill(x0, plan.vectors, plan.gains(self.reaching)),
+        self._check_gains(buffers.fill(x0, plan.vectors, plan.gains(self.reaching)))
+        batch = self.roll_out(
+            buffers,
             plan.times,
             span,
             start=start,
@@ -755,6 +796,7 @@ class ClosedLoop:
             every=every,
             record=record,
             noise=noise,
+            precise=True,
         )
         last = self._ending(plan, batch, start)
         return self._trajectory(batch, record[0], last, start, every)

@@ -257,7 +257,7 @@ class SetPoints:
         for t, given in self.pairs:
             point = by_names(f"set-point of '{mechanism.name}'", given)
             for name, value in point.items():
-                one_of(f"set-point of '{mechanism.name}'", name, mechanism.state_names)
+                mechanism.check_state_name("set-point", name)
                 if name not in names:
                     _refuse_velocity(mechanism, name, value)
                 elif value != q[names.index(name)]:

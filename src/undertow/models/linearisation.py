@@ -306,7 +306,9 @@ def controllability(mechanism: Mechanism) -> float:
     """
     lin = linearise(mechanism)
     A = lin.A
-    B = lin.input * np.linalg.norm(A, 2) / np.linalg.norm(lin.input, axis=0)
+    largest = np.abs(lin.input).max(axis=0)
+    B = lin.input / np.where(largest > 0, largest, 1.0)  # squares of it neither vanish nor overflow
+    B *= np.linalg.norm(A, 2) / np.fmax(np.linalg.norm(B, axis=0), 1.0)
     scale = float(np.linalg.norm(np.hstack([A, B]), 2))
     tests = [
         np.linalg.svd(np.hstack([eigenvalue * np.eye(len(A)) - A, B]), compute_uv=False)[-1]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
@@ -585,6 +586,26 @@ class Mechanism:
             )
         return self.state(**self.start)
 
+    @checked
+    def check_state_name(self, what: str, name: str) -> None:
+        """Refuse a name that no state has; ``what`` it is meant for begins the message.
+
+        Of a coordinate that an input acts on together with others, the message tells what it is.
+
+        Raises
+        ------
+        InvalidInputError
+            For an unknown state name.
+        """
+        meant = name.removesuffix("_dot")
+        told = [
+            f"{c.name} is {c.description}"
+            for c in self.coordinates
+            if meant in re.split(r"\W+", c.description)
+        ]
+        remedy = ". ".join(["Use a coordinate's name, or its velocity's", *told])
+        one_of(f"{what} of '{self.name}'", name, self.state_names, remedy)
+
     def state(self, /, **values: float) -> FloatArray:
         """Return the state with the named entries set and all others zero, SI units.
 
@@ -593,10 +614,9 @@ class Mechanism:
         InvalidInputError
             For an unknown state name or a value that is not finite.
         """
-        x = np.zeros(2 * self.n)
-        names, remedy = self.state_names, "Use a coordinate's name, or its velocity's"
+        x, names = np.zeros(2 * self.n), self.state_names
         for name, value in by_names(f"state of '{self.name}'", values).items():
-            one_of(f"unknown state of '{self.name}'", name, names, remedy)
+            self.check_state_name("unknown state", name)
             x[names.index(name)] = number_of(
                 f"state '{name}' of '{self.name}'", value, limit="a number, in rad or m, per second"
             )

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from undertow.base import InvalidInputError, check_fields, positive, require
-from undertow.closed_loop import ClosedLoop
+from undertow.closed_loop import ClosedLoop, RolloutBuffers
 from undertow.closed_loop.trajectory import Batch
 from undertow.law import LawLayout, Plan, ReachingLaw, Surface, rising_from_zero
 from undertow.models import FloatArray
@@ -163,9 +163,9 @@ class SearchSpace:
         return Plan(surfaces, self.freedom.times, laws)
 
     def batch(self, x: FloatArray, z: FloatArray, **how: Any) -> Batch:
-        """Roll out the plans at coordinates (N, d) from a state, see ``ClosedLoop.batch``."""
-        vectors, gains = self.decode(z)
-        return self.loop.batch(x, vectors, reaching=gains, switch_times=self.freedom.times, **how)
+        """Roll out the plans at coordinates (N, d) from a state, see ``ClosedLoop.roll_out``."""
+        buffers = RolloutBuffers(self.loop, len(z), self.segments).fill(x, *self.decode(z))
+        return self.loop.roll_out(buffers, self.freedom.times, **how)
 
 
 @compiled()

@@ -129,10 +129,12 @@ class Experiment(Generic[V, R]):
         book = self.ledger(None) if ledger is None else ledger
 
         def missing() -> Iterator[tuple[Key, tuple[Callable[[], V]]]]:
-            for key, task in self.tasks.items():
+            for place, (key, task) in enumerate(self.tasks.items(), 1):
                 if key not in book.known:
                     words = [part for part in key if part and isinstance(part, str)] or [self.name]
-                    progress(", ".join(words), len(self.finished(book)) / len(self.tasks))
+                    done, every = len(self.finished(book)), len(self.tasks)
+                    which = f"{', '.join(words)} ({place} of {every})"
+                    progress(which, done / every)
                     yield key, (task,)
 
         for key, future in ended(executor or Serial(), missing(), width):

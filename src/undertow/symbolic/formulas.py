@@ -91,6 +91,15 @@ _GREEK = {
     "alpha": "α", "beta": "β", "gamma": "γ", "epsilon": "ε", "eta": "η", "theta": "θ",
     "lambda": "λ", "phi": "φ", "psi": "ψ", "sigma": "σ",
 }  # fmt: skip
+#: Greek letters as TeX names them; other capitals are Latin ones.
+_LETTERS: Mapping[str, str] = dict(
+    re.findall(
+        r"(\S) (\S+)",
+        "α alpha β beta γ gamma δ delta ε epsilon ζ zeta η eta θ theta ι iota κ kappa λ lambda "
+        "μ mu ν nu ξ xi π pi ρ rho ς varsigma σ sigma τ tau υ upsilon φ phi χ chi ψ psi ω omega "
+        "Γ Gamma Δ Delta Θ Theta Λ Lambda Ξ Xi Π Pi Σ Sigma Υ Upsilon Φ Phi Ψ Psi Ω Omega",
+    )
+)
 _DIGITS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 _POWERS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _DOTS = {"dot": "\N{COMBINING DOT ABOVE}", "ddot": "\N{COMBINING DIAERESIS}"}
@@ -116,17 +125,27 @@ def plain_symbol(name: str) -> str:
     return letter + "".join(pieces)
 
 
+def _tex_letter(name: str) -> str:
+    return {"phi": r"\varphi", "epsilon": r"\varepsilon"}.get(name, rf"\{name}")
+
+
+def _tex_letters(word: str) -> str:
+    """Return a word with its Greek letters as commands."""
+    if len(word) == 1:
+        return _tex_letter(_LETTERS[word]) if word in _LETTERS else word
+    return "".join(rf"{_tex_letter(_LETTERS[c])}{{}}" if c in _LETTERS else c for c in word)
+
+
 def _tex_symbol(name: str) -> str:
     stem, index, dots = _parts(name)
-    greek = {"phi": r"\varphi", "epsilon": r"\varepsilon"}
-    letter = greek.get(stem, rf"\{stem}" if stem in _GREEK else stem)
+    letter = _tex_letter(stem) if stem in _GREEK else _tex_letters(stem)
     if len(stem) > 1 and stem not in _GREEK:
-        letter = rf"\mathrm{{{stem}}}"
+        letter = rf"\mathrm{{{letter}}}"
     if dots:
         letter = rf"\{dots}{{{letter}}}"
     if not index:
         return letter
-    pieces = index.split("_")
+    pieces = map(_tex_letters, index.split("_"))
     return f"{letter}_{{{','.join(pieces)}}}"
 
 
@@ -163,7 +182,7 @@ def plain(expression: sp.Expr) -> str:
     >>> plain(sp.Symbol("phi_1_dot") ** 2 * sp.cos(sp.Symbol("phi_1")))
     'φ̇₁² cos(φ₁)'
     """
-    return str(_Plain().doprint(sp.sympify(expression))).replace("-", "−")
+    return str(_Plain({"full_prec": False}).doprint(sp.sympify(expression))).replace("-", "−")
 
 
 def tex(expression: sp.Expr) -> str:
@@ -195,10 +214,9 @@ def tex_words(words: str) -> str:
 
     def formula(match: re.Match[str]) -> str:
         letters, dot, index, power = match.groups()
-        greek = {v: k for k, v in _GREEK.items()}
-        if not (dot or index or power or letters in greek):
+        if not (dot or index or power or set(letters) & set(_LETTERS)):
             return match[0]
-        text = _tex_symbol(greek.get(letters, letters))
+        text = _tex_symbol(letters)
         if dot:
             text = rf"\{'dot' if dot == chr(0x307) else 'ddot'}{{{text}}}"
         if index:

@@ -247,7 +247,9 @@ def _named(
             minus = [coordinates[i].name for i in nonzero if column[i] == -1]
             simple = len(plus) + len(minus) == len(nonzero)
             name = "_plus_".join(plus) + "".join(f"_minus_{k}" for k in minus)
-            text = sp.sstr(sum(column[i] * coordinates[i].symbol for i in nonzero))
+            text = " + ".join(plus) + "".join(f" - {k}" for k in minus)
+            if not simple:
+                text = sp.sstr(sum(column[i] * coordinates[i].symbol for i in nonzero))
             leading = next((i for i in nonzero if column[i] == 1), nonzero[0])
             unit = coordinates[leading].unit
             named.append(Coordinate(name if simple else f"stroke_{j + 1}", unit, text))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any, TypeVar
 
 from undertow.base import (
+    InvalidInputError,
     as_text,
     at_least,
     checked,
@@ -18,7 +20,7 @@ from undertow.base import (
     table,
 )
 from undertow.cascade import Cascade
-from undertow.estimators import Belief
+from undertow.estimators import Belief, StateFeedback
 from undertow.law import Surface
 from undertow.models import FloatArray, Mechanism, StateLike
 from undertow.objective import Objective
@@ -35,6 +37,9 @@ from undertow.studies.trials.trial import MakeController, Outcome, trial
 
 #: What :func:`compare` takes for a controller.
 Contender = Cascade | Surface | MakeController
+
+#: What a cell of the table means.
+NOT_YET = "not yet: still on its way when the run ended; give it more seconds"
 
 T = TypeVar("T")
 
@@ -79,12 +84,17 @@ class Comparison:
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """A row for each run: names, whether it balanced, when it settled, what it cost."""
+        """A row for each run: names, whether it balanced, when it settled, what it cost.
+
+        ``approaching`` is whether the free coordinates were home and the driven ones still coming
+        nearer when the run ended: a longer one may show that it balances.
+        """
         return [
             {
                 "controller": controller,
                 "plant": plant,
                 "balanced": outcome.balanced,
+                "approaching": outcome.approaching,
                 "settled_s": outcome.settled,
                 "cost": outcome.cost,
                 "effort": outcome.effort,
@@ -111,7 +121,7 @@ class Comparison:
             [
                 row["controller"],
                 row["plant"],
-                "yes" if row["balanced"] else "no",
+                "yes" if row["balanced"] else "not yet" if row["approaching"] else "no",
                 f"{row['settled_s']:.3g}",
                 number(row["cost"], ".4g"),
             ]
@@ -122,7 +132,8 @@ class Comparison:
     def __str__(self) -> str:
         """Return the table as text."""
         heads, *lines = self._cells()
-        return as_text(table(heads, lines, left=heads[:3])).decode().rstrip()
+        text = as_text(table(heads, lines, left=heads[:3])).decode().rstrip()
+        return f"{text}\n{NOT_YET}" if any(line[2] == "not yet" for line in lines) else text
 
     def __repr__(self) -> str:
         """Show how many balanced."""
@@ -190,6 +201,8 @@ def compare(
     named = controllers
     if not isinstance(named, Mapping):
         named = _numbered([(_name(item), item) for item in named])
+    for controller in named.values():
+        _check_maker(controller)
     meets: Mapping[str, Bench | Mechanism]
     if isinstance(plants, Mapping):
         meets = plants
@@ -225,7 +238,37 @@ def _maker(
         return cascade_and_kept(controller, bench, start)[0]
     if isinstance(controller, Surface):
         return keeping(mechanism, controller)
-    return controller
+
+    def make(seen: FloatArray) -> StateFeedback:
+        made = controller(seen)
+        if not callable(made):
+            raise _no_maker(controller, f"{made!r} when called with the start")
+        return made
+
+    return make
+
+
+def _check_maker(controller: Contender) -> None:
+    """Refuse a function that cannot be called with a start alone, such as a law u(t, x)."""
+    if isinstance(controller, Cascade | Surface):
+        return
+    try:
+        taken = inspect.signature(controller)
+    except ValueError:  # some functions of C do not say what they take
+        return
+    try:
+        taken.bind(None)
+    except TypeError:
+        raise _no_maker(controller, f"a function that takes {taken}") from None
+
+
+def _no_maker(controller: Contender, value: str) -> InvalidInputError:
+    return InvalidInputError(
+        f"controller '{_name(controller)}' of compare",
+        value=value,
+        limit="a function of the measured start that returns a function of t and x",
+        remedy="Of a law u(t, x) write lambda start: law",
+    )
 
 
 def _name(controller: Contender) -> str:

@@ -63,9 +63,14 @@ class Result:
 
 @dataclass(frozen=True, eq=False)
 class Outcome(Result):
-    """What came of one run, and the ``record`` of it."""
+    """What came of one run, and the ``record`` of it.
+
+    ``approaching``: whether it was caught and the driven coordinates, too, were home when it ended
+    or nearer to it than a second before.
+    """
 
     record: Record
+    approaching: bool = False
 
     @property
     def numbers(self) -> Result:
@@ -135,10 +140,14 @@ def judge(
     near = np.where(driven, HOME_DRIVEN, HOME_FREE) if home is None else np.asarray(home)
     settled = _settled(record, near)
     last = record.t[-1] - LAST
+    caught = bool(_settled(record, np.where(driven, math.inf, near)) <= last)
+    before = np.abs(record.truth[np.searchsorted(record.t, last), : mechanism.n])
+    now = np.abs(record.truth[-1, : mechanism.n])
     return Outcome(
         seed=seed,
         balanced=bool(settled <= last),
-        caught=bool(_settled(record, np.where(driven, math.inf, near)) <= last),
+        caught=caught,
+        approaching=caught and bool(((now <= near) | (now < before)).all()),
         settled=settled,
         cost=math.nan if objective is None else _cost(mechanism, objective, record),
         effort=record.effort,
