@@ -8,7 +8,7 @@ cascade's answers come a period late.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -134,8 +134,12 @@ def cascade_and_kept(
 ) -> tuple[MakeController, MakeController]:
     """Return the makers of the cascade and of its first optimum, kept: one search from x0, (2n,).
 
-    Both are as :func:`undertow.runtime.for_rig` makes them for what is told of the bench. Raises
-    InfeasibleError when the first optimisation finds no admissible surface.
+    Both are as :func:`undertow.runtime.for_rig` makes them for what is told of the bench.
+
+    Raises
+    ------
+    InfeasibleError
+        When the first optimisation finds no admissible surface.
     """
     known = estimator_for(cascade.mechanism, bench, known=cascade.known)
     suited = for_rig(cascade, known)
@@ -151,9 +155,14 @@ class NMPC:
     The objective gives the stage cost, its quadratic part the terminal cost; inputs count from the
     one that holds the target. A solution is made every ``period``, s, by at most ``iterations`` of
     the interior-point method, for a ``horizon``, s, in which an input is held for ``step``, s, at a
-    time. Raises InvalidInputError for a stage cost that does not rise with every input, such as
-    least time; ModelError for one with kinks, and where no linear feedback stabilises the
-    mechanism.
+    time.
+
+    Raises
+    ------
+    InvalidInputError
+        For a stage cost that does not rise with every input, such as least time.
+    ModelError
+        For one with kinks, and where no linear feedback stabilises the mechanism.
     """
 
     def __init__(
@@ -255,41 +264,61 @@ def _value(belief: Mechanism, Q: FloatArray, R: FloatArray) -> FloatArray:
         raise uncontrollable(belief) from error
 
 
+@dataclass(frozen=True, eq=False)
+class LinearFeedback:
+    """u = u_0 + K x within the inputs' limits: u_0 and ``limits`` (m,), ``gains`` K (m, 2n)."""
+
+    rest: FloatArray
+    gains: FloatArray
+    limits: FloatArray
+
+    def __call__(self, t: float, x: FloatArray) -> FloatArray:
+        """Return the input at (t, x), (m,)."""
+        return np.clip(self.rest + self.gains @ x, -self.limits, self.limits)
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """A maker of controllers that gives the same one to each run, set back; with a name."""
+
+    label: str
+    controller: StateFeedback = field(repr=False)
+
+    @property
+    def __name__(self) -> str:
+        """Its name, as that of a function that makes controllers."""
+        return self.label
+
+    def __call__(self, start: FloatArray) -> StateFeedback:
+        """Return the controller of a run from ``start``."""
+        if isinstance(self.controller, NMPC):
+            self.controller.reset()
+        return self.controller
+
+
 def predictive(belief: Mechanism, objective: Objective, **settings: Any) -> MakeController:
     """Return the maker of an NMPC controller: the same one for each run, set back."""
-    controller = NMPC(belief, objective, **settings)
-
-    def make(_start: FloatArray) -> StateFeedback:
-        controller.reset()
-        return controller
-
-    return _named("NMPC", make)
-
-
-def _named(name: str, make: MakeController) -> MakeController:
-    """Give a maker of controllers the name that tables show."""
-    make.__name__ = name
-    return make
+    return Made("NMPC", NMPC(belief, objective, **settings))
 
 
 def clipped_regulator(belief: Mechanism, free: float = 10.0) -> MakeController:
     """Return a linear-quadratic regulator, its output clipped: Q of the first surface.
 
     It acts about the input that holds the target.  ``free`` is the weight of the free coordinates.
-    Raises ModelError where no linear feedback stabilises the mechanism.
+
+    Raises
+    ------
+    ModelError
+        Where no linear feedback stabilises the mechanism.
     """
     lin, rest = linearise(belief), holding_input(belief)
     n, m = belief.n, belief.m
     limit = belief.input_limits
     Q = np.diag([1.0] * m + [free] * (n - m) + [0.1] * n)
     R = np.diag(1.0 / finite_limits(belief) ** 2)
-    P = _value(belief, Q, R)
-    k = np.asarray(-np.linalg.solve(R, lin.input.T @ P), np.float64)
+    k = -np.linalg.solve(R, lin.input.T @ _value(belief, Q, R))
     slowest = np.linalg.eigvals(lin.A + lin.input @ k).real.max()
     if not slowest < -UNCONTROLLABLE * np.linalg.norm(lin.A, 2):  # a mode that k does not reach
         raise uncontrollable(belief)
 
-    def feedback(_t: float, x: FloatArray) -> FloatArray:
-        return np.clip(rest + k @ x, -limit, limit)
-
-    return _named("LQR, clipped", lambda _start: feedback)
+    return Made("LQR, clipped", LinearFeedback(rest, np.asarray(k, np.float64), limit))
