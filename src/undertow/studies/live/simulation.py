@@ -534,6 +534,7 @@ class Simulation:
         self.law(error)
         if self.law.margin[0] > self._settings.min_margin:
             self.memory = replace(self.memory, plan=plan, since=self.t)
+            self._tell(True, "a plan in reserve: the velocities have jumped", math.nan)
         else:
             self.law.lane, self.law.reaching = lane, before
             self.law.surface = self.memory.surface
@@ -541,18 +542,29 @@ class Simulation:
     def _decide(self, answer: Answer, accepted: bool, why: str) -> None:
         """Say what has become of an answer."""
         memory = self.memory or self._idle
-        learnt = {}
+        predicted = memory.predicted if answer.memory is memory else math.nan  # of another state
+        self._tell(accepted, why, predicted, ms=1e3 * answer.seconds, first=answer.jump)
+
+    def _tell(
+        self,
+        accepted: bool,
+        why: str,
+        predicted: float,
+        ms: float | None = None,
+        first: bool = False,
+    ) -> None:
+        """Tell viewers what plan is in use now, why, and what the answer took that it is from."""
+        memory, learnt = self.memory or self._idle, {}
         if memory.estimate is not None:
             values = self._belief.values(memory.estimate.offset)
             places = zip(self._belief.places, self._belief.tolerances, strict=True)
             for place, name in places:
                 learnt[name] = float(values[place])
         reaching = self.law.reaching
-        predicted = memory.predicted if answer.memory is memory else math.nan  # of another state
         message = plan_message(self.t, accepted, why, memory.surface, predicted, reaching)
-        ghost = self.scene.places(self._goal, self._parameters).tolist()
         message |= {
-            "ms": 1e3 * answer.seconds, "first": answer.jump, "learnt": learnt, "ghost": ghost,
+            "ms": ms, "first": first, "learnt": learnt,
+            "ghost": self.scene.places(self._goal, self._parameters).tolist(),
             "goal": self._goal.tolist(), "objective": self._task.objective,
             "plausible": plausible(self._belief, memory.estimate),
         }  # fmt: skip
