@@ -360,9 +360,9 @@ def test_a_delay_that_nobody_told_is_found(name: str, late: float) -> None:
             shake = 0.1 * limits * rng.uniform(-1.0, 1.0, model.m)
         u = np.clip(law(x) + shake, -limits, limits)
         rig.write(u)
-    assert abs(kalman.delay - 0.001 - late) < 0.003
+    assert abs(kalman.estimated_delay - 0.001 - late) < 0.003
     kalman.reset(np.zeros(2 * model.n))
-    assert kalman.delay == 0.001
+    assert kalman.estimated_delay == 0.001
 
 
 def test_how_soon_the_motion_answers_is_the_derivative_by_the_delay(arm: Mechanism) -> None:
