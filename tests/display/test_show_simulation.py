@@ -201,6 +201,7 @@ def test_a_push_is_an_impulse_and_is_recovered_from(simulation: Simulation) -> N
     assert simulation.rig.truth[3] - before[3] == pytest.approx(0.7, abs=0.1)
     reserve, *decided = plans(go(simulation, 2.0))
     assert reserve["why"] == "a plan in reserve: the velocities have jumped"
+    assert simulation.memory is not None
     assert (
         reserve["rows"]
         == simulation._cascade(simulation.controls.task)
