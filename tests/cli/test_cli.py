@@ -9,16 +9,19 @@ import json
 import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
+import time
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import sympy as sp
+import typer
 from typer.main import get_command
 
 import undertow as ut
@@ -34,9 +37,13 @@ from undertow.cli.parsing import (
     parse_target,
     parse_values,
 )
-from undertow.cli.terminal import progress_bar, show
+from undertow.cli.terminal import carry_out, progress_bar, show
 from undertow.closed_loop import Event, Trajectory
 from undertow.closed_loop.trajectory import recorded
+from undertow.proofs import read_certificate
+from undertow.studies.certification import decide
+from undertow.studies.experiment import Experiment
+from undertow.studies.ledger import Key
 from undertow.studies.motion import ended
 
 RIG = "rotary_pendulum"
@@ -171,6 +178,11 @@ def test_version_and_bare_call() -> None:
             "> 0",
         ),
         (("optimise", RIG, "--evaluations", "0"), "0 evaluations", "at least 1"),
+        (("simulate", RIG, "--evaluations", "0"), "0 evaluations", "at least 1"),
+        (("simulate", RIG, "--control", "designed", "--evaluations", "9"), "9", "a cascade"),
+        (("simulate", RIG, "--start", "phi=1e300rad"), "1e+300 rad", "±4.5e+13 rad"),
+        (("optimise", RIG, "--start", "theta_dot=1e14rad/s"), "1e+14 rad/s", "±4.5e+13 rad/s"),
+        (("show", RIG, "--save", "page.html", "--start", "phi=1e300rad"), "1e+300", "±4.5e+13"),
         (("simulate", CRANE, "--target", "x=2m"), "x = 2 m", "95 % of the travel"),
         (
             ("simulate", CRANE, "--target", "x=2"),
@@ -318,6 +330,9 @@ def test_infeasible_task_exits_1_with_the_evidence() -> None:
     assert code == 1
     assert "no admissible surface" in err
     assert "the best candidate" in err
+    assert "--evaluations of simulate and optimise" in err
+    for name in ("simulate", "optimise"):
+        assert any("--evaluations" in one.opts for one in COMMANDS[name,].params)
 
 
 def test_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:
@@ -329,6 +344,10 @@ def test_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path
     assert "--out" in err
     code, out, _ = run("reproduce", "--out", str(tmp_path / "taken"))
     assert (code, out) == (1, "")
+    code, _, err = run("show", RIG, "--save", str(tmp_path / "taken" / "page.html"))
+    assert code == 1
+    assert "Name another one with --save" in err
+    assert "--out" not in err
 
 
 # -- work --------------------------------------------------------------------------------------
@@ -384,6 +403,81 @@ def test_simulate_with_no_further_choice_runs_the_cascade() -> None:
     assert code == 0
     assert "reached the target" in out
     assert "admitted" in out
+
+
+ARM = """<robot name="arm">
+ <link name="base"/>
+ <link name="arm"><inertial><origin xyz="0.1 0 0"/><mass value="0.1"/>
+  <inertia ixx="1e-4" iyy="3e-4" izz="3e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>
+ <link name="rod"><inertial><origin xyz="0 0 0.15"/><mass value="0.05"/>
+  <inertia ixx="4e-4" iyy="4e-4" izz="1e-5" ixy="0" ixz="0" iyz="0"/></inertial></link>
+ <joint name="shoulder" type="continuous"><parent link="base"/><child link="arm"/>
+  <axis xyz="0 0 1"/><limit effort="0.6" velocity="50"/>
+  <dynamics friction="0.06" damping="0.001"/></joint>
+ <joint name="hinge" type="continuous"><origin xyz="0.2 0 0"/><parent link="arm"/>
+  <child link="rod"/><axis xyz="1 0 0"/></joint>
+</robot>"""
+
+
+@pytest.mark.parametrize("control", ["designed", "cascade"])
+def test_a_model_file_with_dry_friction_gets_the_layer_that_it_asks_for(
+    tmp_path: Path, control: str
+) -> None:
+    """A tenth of the motor's torque: 'run' balanced it, 'simulate' refused it for its gains."""
+    (tmp_path / "arm.urdf").write_text(ARM)
+    code, out, err = run("simulate", f"{tmp_path}/arm.urdf:shoulder", "--control", control)
+    assert (code, "error" in err) == (0, False)
+    assert "boundary layer 0.2, 2 times as thick as usual" in " ".join(out.split())
+
+
+def test_what_is_proved_before_an_interruption_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C in the search for a region left nothing of the claims before it."""
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(decide, "prove_region", interrupted)
+    code, out, err = run("certify", RIG, "--surface", SURFACE, "--out", str(tmp_path))
+    assert code == 130
+    assert "the law exists for" in out
+    assert "claims had been proved, they are in" in err
+    kinds = [one.kind for one in read_certificate(tmp_path / "certificate.json").subjects[0].claims]
+    assert kinds[:2] == ["stability", "terminal ellipsoid"]
+
+
+def test_a_prediction_that_fails_costs_no_proof(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gains too fast for its step ended the command, and with it all that was proved."""
+
+    def refused(*_: object, **__: object) -> None:
+        raise InvalidInputError("step for the gains", value="0.002 s", limit="less")
+
+    monkeypatch.setattr(decide, "assess", refused)
+    code, out, _ = run("certify", RIG, "--surface", SURFACE, "--seconds", "0")
+    assert code == 0
+    assert "step for the gains: got 0.002 s" in " ".join(out.split())
+
+
+def test_a_polite_kill_shows_what_is_finished(capfd: pytest.CaptureFixture[str]) -> None:
+    """SIGTERM, with which batch systems end what takes too long, lost every finished row."""
+
+    def killed() -> float:
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(1.0)
+        return 2.0
+
+    tasks: dict[Key, Callable[[], float]] = {("one",): lambda: 1.0, ("two",): killed}
+    work: Experiment[float, Any] = Experiment(
+        "numbers", tuple[str, float], tasks, {}, lambda found: [f"finished: {found}"]
+    )
+    with pytest.raises(typer.Exit) as ending:
+        carry_out(work, None)
+    assert ending.value.exit_code == 130
+    out, err = capfd.readouterr()
+    assert "finished: (1.0,)" in out
+    assert "interrupted: 1 of 2 are done" in err
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
 def test_simulate_on_a_plant_that_the_controller_does_not_know() -> None:

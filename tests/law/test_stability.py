@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,14 @@ from numpy.typing import NDArray
 
 import undertow as ut
 from undertow.base import InvalidInputError, ModelError, SingularSurfaceError, UnstableSurfaceError
-from undertow.law import quadratic_designs, sliding_matrix, stability_margin
+from undertow.law import (
+    OVERSHOOTS,
+    gains_at_target,
+    quadratic_designs,
+    sliding_matrix,
+    stability_margin,
+    usual_reaching,
+)
 from undertow.models import Linearisation, controllability, linearise
 from undertow.studies.paper import CASES
 
@@ -546,3 +554,21 @@ def test_a_surface_shows_no_negative_zeros() -> None:
         "Surface(alpha_a=[[-1.0, 0.0], [0.0, -1.0]], lambda_a=[[-1.0, 0.0], [0.0, -1.0]], "
         "alpha_u=[[-0.8], [0.0]], lambda_u=[[3.4], [0.0]])"
     )
+
+
+def test_a_boundary_layer_is_as_thick_as_disturbances_ask_for() -> None:
+    """The gains (13) of a tenth of the input: doubled until k/ε is below 2 per period, no more."""
+    rig = ut.mechanisms.rotary_pendulum()
+    assert usual_reaching(rig) == ut.ReachingLaw()
+    rubbing = replace(rig, disturbance_bounds=(0.5, 0.0))
+    surface = ut.first_surface(rubbing)
+    for period in (0.002, 0.02):
+        law = usual_reaching(rubbing, period=period)
+        layer = float(np.max(law.layer))
+        gain = gains_at_target(rubbing, surface.vector[None], np.array([[20.0]])).max()
+        assert gain / layer * period < OVERSHOOTS <= gain / (layer / 2) * period
+        assert ut.Cascade(rubbing, step=period, period=0.2).reaching == law
+    own = ut.ReachingLaw(layer=0.3)
+    assert ut.Cascade(rubbing, reaching=own).reaching is own
+    with pytest.raises(InvalidInputError, match="period of the law"):
+        usual_reaching(rubbing, period=0.0)

@@ -1,6 +1,12 @@
 """What every other package stands on: checks of arguments, errors, verdicts, files and tables."""
 
-from undertow.base.interrupt import INTERRUPTED, at_once, by_exception, interruptible
+from undertow.base.interrupt import (
+    INTERRUPTED,
+    at_once,
+    by_exception,
+    ended_as_interrupted,
+    interruptible,
+)
 
 at_once()
 
@@ -91,6 +97,7 @@ __all__ = [
     "checked",
     "duration",
     "each",
+    "ended_as_interrupted",
     "error_text",
     "facts",
     "file_hash",

@@ -219,13 +219,15 @@ def file_name(name: str) -> str:
     return "".join(c if c.isprintable() else "_" for c in plain)[:100] or "_"
 
 
-def check_folder(folder: Path) -> None:
+def check_folder(folder: Path, option: str = "--out") -> None:
     """Make the folder and prove that it can be written, before any long work.
 
-    Raises ArtefactError when it cannot.
+    ``option``: of the command line, by which another one is named. Raises ArtefactError when it
+    cannot.
     """
-    refusal = "a folder that can be written", "Name another one with --out"
-    with or_refused(f"results folder '{folder}'", *refusal):
+    refusal = "a folder that can be written", f"Name another one with {option}"
+    what = "results folder" if option == "--out" else f"folder of {option}"
+    with or_refused(f"{what} '{folder}'", *refusal):
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
 

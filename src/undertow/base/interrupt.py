@@ -50,6 +50,23 @@ def by_exception() -> None:
 
 
 @contextmanager
+def ended_as_interrupted() -> Iterator[None]:
+    """Let SIGTERM, with which systems end what has run too long, end what is done in it as Ctrl-C.
+
+    Where somebody else handles it, and in other threads than the main one, nothing changes.
+    """
+    mine = signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    if not mine or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+@contextmanager
 def interruptible() -> Iterator[None]:
     """Let Ctrl-C end what is done in it, also where it meets a function that C calls.
 

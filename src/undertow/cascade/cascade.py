@@ -54,6 +54,7 @@ from undertow.law import (
     Surface,
     Target,
     check_surface,
+    usual_reaching,
 )
 from undertow.models import TIME, FloatArray, Mechanism, StateLike, number_of
 from undertow.objective import Objective, objective_for
@@ -61,6 +62,9 @@ from undertow.optimiser import Budget, DecisionVariables, Optimiser, Planner, Pr
 
 #: Stands for the objective that is meant where nobody says, until the mechanism is known.
 _USUAL = cast(Objective, None)
+
+#: Stands for the reaching law that is meant where nobody says, until mechanism and step are known.
+_SUITED = cast(ReachingLaw, None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +81,8 @@ class Cascade:
         off.  The travel that the mechanism declares joins its constraints, see
         :meth:`undertow.Objective.on`.
     reaching
-        Reaching law of the inner loop.
+        Reaching law of the inner loop; by default :func:`undertow.law.usual_reaching`: the paper's,
+        its boundary layer as thick as the mechanism's disturbance bounds ask for.
     period
         Δt between re-optimisations, s.
     first
@@ -149,7 +154,7 @@ class Cascade:
 
     mechanism: Mechanism
     objective: Objective = _USUAL
-    reaching: ReachingLaw = ReachingLaw()
+    reaching: ReachingLaw = _SUITED
     period: float = 0.1
     first: Surface | None = None
     step: float = 0.002
@@ -170,6 +175,12 @@ class Cascade:
         if self.objective is None:
             check_fields(self, "mechanism")
             object.__setattr__(self, "objective", objective_for(self.mechanism))
+        if self.reaching is None:
+            check_fields(self, "mechanism", "first", "step", "zoh_steps")
+            positive("rollout step, s", self.step)
+            sample = self.step * max(1, self.zoh_steps)
+            law = usual_reaching(self.mechanism, self.first, period=sample)
+            object.__setattr__(self, "reaching", law)
         check_fields(self)
         object.__setattr__(self, "objective", self.objective.on(self.mechanism))
         if TIME in self.mechanism.force.free_symbols:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.console import RenderableType
 
 from undertow.base import Progress, one_of, require
 from undertow.cascade import Cascade
@@ -19,8 +20,17 @@ from undertow.cli.parsing import (
     parse_task,
     parse_values,
 )
-from undertow.cli.terminal import check_out, command, exit_unless, progress_bar, show, write
-from undertow.law import first_surface
+from undertow.cli.terminal import (
+    check_out,
+    command,
+    completed,
+    end_interrupted,
+    exit_unless,
+    progress_bar,
+    show,
+    write,
+)
+from undertow.law import first_surface, usual_reaching
 from undertow.mechanisms import LIBRARY
 from undertow.models import Mechanism
 from undertow.models.importers.python_file import in_a_file
@@ -126,33 +136,57 @@ def certify(
     held = not (loop and within) or hold
     require(held, "--within with --loop", "no --hold", "a held input")
     check_out(out)
-    report: Any
-    with progress_bar() as progress:
-        if appendix:
-            mechanism = mechanism_named("rotary_pendulum", setting)
+    found: dict[str, Certified] = {}
+    reports: list[RenderableType] = []
+    task = x0 = used = None
+    if run:
+        task = parse_task(str(name), start, objective, horizon, settings=setting)
+    mechanism = task[0] if task else mechanism_named(str(name or "rotary_pendulum"), setting)
+    uncertain = _box(mechanism, within)
+    if not (run or appendix):
+        x0 = parse_start(mechanism, start)
+        used = parse_surface(mechanism, surface) if surface else first_surface(mechanism)
+
+    def keep(one: Certified) -> None:
+        found[one.title] = one
+
+    def prove(progress: Progress) -> None:
+        if task is not None:
+            _, begin, goal = task
+            cascade = Cascade(mechanism, goal, gate=certified_gate(), seed=seed, belief="exact")
+            motion = cascade.simulate(begin, progress=lambda t, end: progress("cascade", t / end))
+            for one in certification.certify_run(mechanism, motion, kept=keep, progress=progress):
+                keep(one)
+            reports.append(certification.run_report(motion))
+        elif x0 is None or used is None:
             cases = certification.certify_appendix(
                 mechanism, seconds=seconds or 0.0, loop=loop, loop_seconds=effort, hold=hold,
-                uncertain=_box(mechanism, within), progress=progress,
+                uncertain=uncertain, kept=keep, progress=progress,
             )  # fmt: skip
-            certified, report = cases, certification.appendix_report(cases)
-        elif run:
-            mechanism, x0, goal = parse_task(str(name), start, objective, horizon, settings=setting)
-            cascade = Cascade(mechanism, goal, gate=certified_gate(), seed=seed, belief="exact")
-            motion = cascade.simulate(x0, progress=lambda t, end: progress("cascade", t / end))
-            certified = certification.certify_run(mechanism, motion, progress=progress)
-            report = certification.run_report(motion)
+            reports.append(certification.appendix_report(cases))
         else:
-            mechanism = mechanism_named(str(name), setting)
-            x0 = parse_start(mechanism, start)
-            used = parse_surface(mechanism, surface) if surface else first_surface(mechanism)
             one = certification.certify_surface(
-                mechanism, used, x0, seconds=60.0 if seconds is None else seconds,
-                loop=loop, loop_seconds=effort, hold=hold, uncertain=_box(mechanism, within),
+                mechanism, used, x0, reaching_law=usual_reaching(mechanism, used),
+                seconds=60.0 if seconds is None else seconds,
+                loop=loop, loop_seconds=effort, hold=hold, uncertain=uncertain, kept=keep,
                 progress=progress,
             )  # fmt: skip
-            certified, report = (one,), certification.subject_report(mechanism, one)
-        written = write(out, lambda: _files(mechanism, certified, progress), report, least=80)
-    show(report, *written, least=80)
+            keep(one)
+
+    every = completed(prove, found)
+    certified = [*found.values()]
+    if not reports:
+        reports.extend(certification.subject_report(mechanism, one) for one in certified)
+    with progress_bar() as progress:
+        written = write(out, lambda: _files(mechanism, certified, progress), *reports, least=80)
+    show(*reports, *written, least=80)
+    if not every:
+        count = sum(len(one.subject.claims) for one in certified)
+        where = f"in {out}/certificate.json" if out and count else "not written"
+        end_interrupted(
+            f"interrupted: {count} claims had been proved, they are {where}. The same command "
+            "proves all anew; with less of --seconds and --loop-seconds it ends sooner"
+        )
     proved = [{c.kind for c in item.subject.claims} for item in certified]
     exit_unless(all("stability" in kinds for kinds in proved))
 

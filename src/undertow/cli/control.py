@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,7 +14,7 @@ from undertow.cli import options
 from undertow.cli.parsing import aimed, parse_surface, parse_target, parse_task, parse_values
 from undertow.cli.terminal import check_out, command, exit_unless, progress_bar, show, write
 from undertow.closed_loop import ClosedLoop
-from undertow.law import check_surface, first_surface
+from undertow.law import check_surface, first_surface, usual_reaching
 from undertow.objective import USUAL
 from undertow.optimiser import Budget, DecisionVariables, Optimiser
 from undertow.runtime import default_gate
@@ -50,6 +51,7 @@ def simulate(
     accept: list[str] | None = None,
     known: Annotated[Literal["usual", "exact"] | None, typer.Option("--belief")] = None,
     schedule: float = 0.0,
+    evaluations: int | None = None,
     seed: options.Seed = 0,
     out: Path | None = None,
 ) -> None:
@@ -80,6 +82,8 @@ def simulate(
         Surfaces one after another with free reaching laws; for least time each for so long at most,
         s, following the earliest motion over all inputs. 0.1, the period, is usual. 0: one surface
         at a time.
+    evaluations
+        Largest number of rollouts of the first search; by default as it needs.
     out
         Folder for motion.csv, motion.png and manifest.json.
     """
@@ -95,6 +99,7 @@ def simulate(
     request["control"] = steering = control or ("cascade" if given is None else "given surface")
     check_out(out)
     run = cascade = None
+    loop: Cascade | ClosedLoop
     if goes_to is not None and steering != "cascade":
         raise InvalidInputError(
             f"--target with --control {steering}" if given is None else "--target with --surface",
@@ -115,12 +120,27 @@ def simulate(
                 limit="the cascade, which decides by it",
                 remedy="Leave it out, or --control and --surface",
             )
+    if evaluations is not None and steering not in ("cascade", "one-time"):
+        raise InvalidInputError(
+            "--evaluations",
+            value=f"{evaluations}, without a search",
+            limit="for a cascade, or --control one-time",
+            remedy="Leave it out",
+        )
+    cold = None if evaluations is None else Budget(evaluations)
     if steering == "cascade":
         gate = default_gate() if accept is None else _evidence_gate(accept)
         known = known or ("exact" if accept or schedule else "usual")
         freedom = DecisionVariables(reaching=schedule > 0, schedule=schedule)
-        cascade = Cascade(
-            belief, goal, period=period, gate=gate, seed=seed, belief=known, freedom=freedom
+        loop = cascade = Cascade(
+            belief,
+            goal,
+            period=period,
+            gate=gate,
+            seed=seed,
+            belief=known,
+            freedom=freedom,
+            cold=cold,
         )
         with progress_bar() as progress:
             run = cascade.simulate(
@@ -131,17 +151,18 @@ def simulate(
             )
         motion, surfaces = run.trajectory, run.surfaces
     else:
-        if given is None:
-            given = first_surface(belief)
-            if steering == "one-time":
-                with progress_bar() as progress:
-                    progress("searching for the best surface", 0.0)
-                    found = Optimiser(ClosedLoop(belief, goal), seed=seed).require(x0)
-                given = found.surface or given
-        check_surface(belief, given, x0)
-        motion, surfaces = ClosedLoop(belief, goal, plant=truth).simulate(x0, given), (given,)
+        used = given or first_surface(belief)
+        loop = ClosedLoop(belief, goal, usual_reaching(belief, used))
+        if steering == "one-time":
+            with progress_bar() as progress:
+                progress("searching for the best surface", 0.0)
+                used = Optimiser(loop, cold=cold, seed=seed).require(x0).surface or used
+        check_surface(belief, used, x0)
+        motion, surfaces = replace(loop, plant=truth).simulate(x0, used), (used,)
     words = ", ".join(target or ())
-    said = motion_report(belief, goal, x0, motion, surfaces[0], run, cascade, goes_to, words)
+    said = motion_report(
+        belief, goal, x0, motion, surfaces[0], run, cascade, goes_to, words, loop.reaching
+    )
     written = write(out, lambda: motion_files(request, motion, motion.cost, surfaces, run), said)
     show(said, *written)
     exit_unless(motion.event.name == "REACHED")
@@ -189,9 +210,10 @@ def optimise(
     belief, x0, goal = parse_task(name, start, objective, horizon, setting, limit, box, hard_input)
     check_out(out)
     cold = None if evaluations is None else Budget(evaluations)
-    optimiser = Optimiser(ClosedLoop(belief, goal), cold=cold, seed=seed)
+    loop = ClosedLoop(belief, goal, usual_reaching(belief))
+    optimiser = Optimiser(loop, cold=cold, seed=seed)
     with progress_bar() as progress:
         progress("searching for the best surface", 0.0)
         proposal = optimiser.require(x0)
-    said = proposal_report(belief, goal, x0, proposal)
+    said = proposal_report(belief, goal, x0, proposal, loop.reaching)
     show(said, *write(out, lambda: proposal_files(request, proposal), said))

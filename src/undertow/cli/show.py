@@ -111,7 +111,7 @@ def show(
         require_extra("websockets", "show", "the live page needs websockets")
         check_port(port or 0)
     else:
-        check_folder(save.parent)
+        check_folder(save.parent, "--save")
         check_place(save, b"<!do")
     log = _is_log(name)
     if mechanism is not None and not log:

@@ -29,6 +29,7 @@ from undertow.base import (
     by_exception,
     check_folder,
     duration,
+    ended_as_interrupted,
     interruptible,
     near,
     printable,
@@ -257,9 +258,12 @@ def progress_bar() -> Iterator[Progress]:
 
 
 def completed(work: Callable[[Progress], object], kept: Sized = (1,)) -> bool:
-    """Work under a progress bar; false where Ctrl-C ended it and something is kept to be shown."""
+    """Work under a progress bar; false where Ctrl-C ended it and something is kept to be shown.
+
+    SIGTERM ends it as Ctrl-C does.
+    """
     try:
-        with progress_bar() as progress, interruptible():
+        with ended_as_interrupted(), progress_bar() as progress, interruptible():
             work(progress)
     except KeyboardInterrupt:
         if not kept:

@@ -41,6 +41,7 @@ from undertow.closed_loop.threads import shared
 from undertow.closed_loop.trajectory import Batch, Event, Trajectory, recorded
 from undertow.closed_loop.work_array import LANES
 from undertow.law import (
+    OVERSHOOTS,
     LawLayout,
     Plan,
     ReachingLaw,
@@ -84,9 +85,6 @@ CALMER = 0.5
 #: make of it.  Twice or four times as much costs no less on a rig, and makes surfaces so soft that
 #: dry friction moves more than noise did.
 NEAR = 0.25
-
-#: k/ε times the period of the law from which on it overshoots ever farther near the surface.
-OVERSHOOTS = 2.0
 
 #: Switch steps of a single surface.
 _AT_ONCE = np.zeros(1, dtype=np.int64)

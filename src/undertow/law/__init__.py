@@ -27,6 +27,7 @@ from undertow.law.sliding import (
     gamma_determinant,
 )
 from undertow.law.stability import (
+    OVERSHOOTS,
     Margin,
     check_surface,
     first_surface,
@@ -35,11 +36,13 @@ from undertow.law.stability import (
     sliding_matrix,
     stability_margin,
     surface_margins,
+    usual_reaching,
 )
 from undertow.law.surface import LawLayout, ProvedSet, ReachingLaw, Surface, Switching
 
 __all__ = [
     "LAYOUT",
+    "OVERSHOOTS",
     "Control",
     "InnerLoop",
     "LawLayout",
@@ -73,4 +76,5 @@ __all__ = [
     "stability_margin",
     "surface_margins",
     "target_of",
+    "usual_reaching",
 ]

@@ -28,8 +28,14 @@ from undertow.base import (
     floats,
     positive,
 )
-from undertow.law.sliding import check_surface_shape, coupling, gamma_determinant, singularity
-from undertow.law.surface import LawLayout, Surface
+from undertow.law.sliding import (
+    check_surface_shape,
+    coupling,
+    gains_at_target,
+    gamma_determinant,
+    singularity,
+)
+from undertow.law.surface import LawLayout, ReachingLaw, Surface
 from undertow.models import (
     UNCONTROLLABLE,
     FloatArray,
@@ -39,6 +45,12 @@ from undertow.models import (
     uncontrollable,
 )
 from undertow.symbolic import content_key, recall, remember
+
+#: k/ε times the period of the law from which on it overshoots ever farther near the surface.
+OVERSHOOTS = 2.0
+
+#: How often a boundary layer is doubled at most.
+DOUBLINGS = 20
 
 
 def sliding_matrix(mechanism: Mechanism, surfaces: ArrayLike | Surface) -> FloatArray:
@@ -262,6 +274,37 @@ def first_surface(
         )
     positive("convergence rate, 1/s", rate, zero=True)
     return _quadratic(mechanism, diagonal, rate)
+
+
+@checked
+def usual_reaching(
+    mechanism: Mechanism, surface: Surface | None = None, *, period: float = 0.002
+) -> ReachingLaw:
+    """Return the paper's reaching law, its boundary layer as thick as disturbances ask for.
+
+    The gains (13) of the mechanism's disturbance bounds, among them dry friction in a model file,
+    may be too fast for a law that is renewed once a ``period``, s: ε is doubled until k/ε is below
+    2 per period near the target, on the ``surface``, by default the first one.  Without bounds it
+    is the paper's law as it is.
+
+    Raises
+    ------
+    InvalidInputError
+        For a period that is not positive, or a surface of another size.
+    ModelError
+        When the first surface cannot be designed.
+    """
+    positive("period of the law, s", period)
+    law = ReachingLaw()
+    if not any(mechanism.disturbance_bounds):
+        return law
+    used = first_surface(mechanism) if surface is None else surface
+    check_surface_shape(mechanism, used)
+    eta, layer = law.per_surface(mechanism.m)
+    rate = gains_at_target(mechanism, used.vector[None], eta[None])[0] / layer * period
+    fastest = float(np.abs(rate).max())
+    doubled = next((k for k in range(DOUBLINGS) if fastest / 2**k < OVERSHOOTS), 0)
+    return ReachingLaw(layer=float(layer.max()) * 2**doubled)
 
 
 @checked

@@ -676,6 +676,7 @@ class Objective:
             With the constraint and its margin.
         """
         problem, start = self.on(mechanism), mechanism.check_state(x)
+        self._check_resolved(mechanism, start)
         margins = [*zip(problem.constraints, problem.path_margins(mechanism), strict=True)]
         held = dict(zip(mechanism.u, holding_input(mechanism).tolist(), strict=True))
         for state, u, which, remedy in (
@@ -696,6 +697,22 @@ class Objective:
                         limit="≥ 0",
                         remedy=remedy,
                     )
+
+    def _check_resolved(self, mechanism: Mechanism, start: FloatArray) -> None:
+        """Refuse a state so large that neighbouring numbers are farther apart than the target."""
+        resolved = self.terminal_radius * 2.0**52
+        sizes = np.abs(start)
+        worst = int(np.argmax(sizes))
+        if sizes[worst] > resolved:
+            c = mechanism.coordinates[worst % mechanism.n]
+            unit = f"{c.unit}{'/s' if worst >= mechanism.n else ''}"
+            raise InvalidInputError(
+                f"initial state '{mechanism.state_names[worst]}' of '{mechanism.name}'",
+                value=f"{start[worst]:g} {unit}",
+                limit=f"within ±{resolved:.3g} {unit}: floating-point numbers beyond are farther "
+                f"apart than the terminal radius {self.terminal_radius:g}",
+                remedy="Start closer to the target",
+            )
 
     @staticmethod
     def _expression(mechanism: Mechanism, what: str, formula: Formula) -> sp.Expr:

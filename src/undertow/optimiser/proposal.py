@@ -17,6 +17,12 @@ from undertow.models.importers import holding_input, least_peak
 Status = Literal["converged", "budget spent", "infeasible", "failed"]
 
 
+#: How a search is given more to spend: in Python, and at the commands that have the option.
+LARGER_BUDGET = (
+    "search longer: cold=undertow.Budget(...) in Python, --evaluations of simulate and optimise"
+)
+
+
 @dataclass(frozen=True)
 class Budget:
     """What one optimisation may spend; it returns its best answer when either is used up.
@@ -207,8 +213,8 @@ def motion_margins(
         + f" at {batch.time[0]:.3g} s",
     }[event]
     remedy = {
-        Event.HORIZON: "Lengthen the horizon, widen the terminal set, or spend a larger budget",
-        Event.COSTLY: "Spend a larger budget",
+        Event.HORIZON: f"Lengthen the horizon, widen the terminal set, or {LARGER_BUDGET}",
+        Event.COSTLY: f"{LARGER_BUDGET[0].upper()}{LARGER_BUDGET[1:]}",
         Event.CONSTRAINT: broken.remedy,
-    }.get(event, "Start closer to the target, or spend a larger budget")
+    }.get(event, f"Start closer to the target, or {LARGER_BUDGET}")
     return tuple(margins), f"the best candidate {ending}", remedy

@@ -14,7 +14,7 @@ import numpy as np
 from undertow.cascade import Cascade, Gate, cost_gate, noise_share, robustness_gate
 from undertow.cascade.robustness import delay_margin
 from undertow.estimators import Belief, Estimator, KalmanFilter
-from undertow.law import ReachingLaw, first_surface
+from undertow.law import ReachingLaw, first_surface, usual_reaching
 from undertow.models import Mechanism, full_accelerations
 from undertow.objective import finite_limits
 from undertow.plants import Bench, Encoder
@@ -24,9 +24,9 @@ from undertow.plants import Bench, Encoder
 #: sensors may take, standard deviation.
 BEARS, LEAST, RESERVE, NOISE = 6, 2, 0.15, 0.2
 
-#: The paper's boundary layer ε, η/ε = 200 per second, for a sample each ``SAMPLE``, s; and how
-#: often it may be doubled for the noise; for the delay once more with a period of twice that.
-LAYER, SAMPLE, DOUBLED = 0.1, 0.001, 3
+#: The period that the paper's boundary layer, η/ε = 200 per second, is for, s; and how often it may
+#: be doubled for the noise; for the delay once more with a period of twice that.
+SAMPLE, DOUBLED = 0.001, 3
 
 #: Density of the drift of a matched disturbance, parts of the smallest input limit per √s.
 DRIFT = 0.1
@@ -102,7 +102,7 @@ def for_rig(cascade: Cascade, estimator: Estimator) -> Cascade:
     gate, reaching, covariance = cascade.gate, cascade.reaching, cascade.covariance
     if gate is cost_gate:
         gate = default_gate(estimator)
-    if reaching == ReachingLaw():
+    if reaching in (ReachingLaw(), usual_reaching(cascade.mechanism, period=cascade.step)):
         reaching = reaching_for(estimator)
     if covariance is None:
         covariance = estimator.noise_covariance()
@@ -110,18 +110,20 @@ def for_rig(cascade: Cascade, estimator: Estimator) -> Cascade:
 
 
 def reaching_for(estimator: Estimator) -> ReachingLaw:
-    """Return the paper's reaching law, its boundary layer as thick as samples and sensors need.
+    """Return the usual reaching law, its boundary layer as thick as samples and sensors need.
 
-    The gains near the target go with η/ε: ε is doubled until the first surface bears the delay that
-    the gate asks for, less a period, and what the estimator does not know takes no more than
-    ``NOISE`` of the input on it, for which it is doubled to ``DOUBLED`` times at most.  Where no
-    layer bears that delay, noise alone decides.
+    The gains near the target go with η/ε: the layer of :func:`undertow.law.usual_reaching` is
+    doubled until the first surface bears the delay that the gate asks for, less a period, and what
+    the estimator does not know takes no more than ``NOISE`` of the input on it, for which it is
+    doubled to ``DOUBLED`` times at most.  Where no layer bears that delay, noise alone decides.
     """
     mechanism, covariance = estimator.mechanism, estimator.steady_covariance()
     period, least = estimator.period, _delay(estimator.period, BEARS - 1)
     surface = first_surface(mechanism)
     most = DOUBLED + math.ceil(math.log2(max(1.0, period / SAMPLE)))
-    laws = [ReachingLaw(layer=LAYER * 2**k) for k in range(most + 1)]
+    usual = usual_reaching(mechanism, surface)
+    thinnest = float(np.max(usual.layer))
+    laws = [replace(usual, layer=thinnest * 2**k) for k in range(most + 1)]
     borne = [
         k
         for k, law in enumerate(laws)

@@ -13,7 +13,7 @@ from undertow.base import facts, finite, manifest, mark, table, to_csv
 from undertow.cascade import Cascade, Gate, Run, Update, problem_words
 from undertow.closed_loop import Event, Trajectory
 from undertow.closed_loop.figures import display, figure_bytes, motion_figure, state_words
-from undertow.law import Surface, Target
+from undertow.law import ReachingLaw, Surface, Target
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import Objective
 from undertow.optimiser import Proposal
@@ -38,14 +38,30 @@ def _surface_words(surface: Surface) -> str:
 
 
 def _head(
-    mechanism: Mechanism, objective: Objective, start: FloatArray, gate: Gate | None = None
+    mechanism: Mechanism,
+    objective: Objective,
+    start: FloatArray,
+    gate: Gate | None = None,
+    reaching: ReachingLaw = ReachingLaw(),
 ) -> list[tuple[str, str]]:
     problem = problem_words(mechanism, objective, gate).removeprefix("objective ")
-    return [
+    rows = [
         ("mechanism", f"{mechanism.name}: {mechanism.description}".removesuffix(": ")),
         ("objective", problem),
         ("start", state_words(mechanism, start)),
     ]
+    if reaching != ReachingLaw():
+        rows.append(("reaching law", _thickness(reaching)))
+    return rows
+
+
+def _thickness(reaching: ReachingLaw) -> str:
+    """Say how thick a boundary layer is, beside the usual one."""
+    layer, usual = (float(np.max(law.layer)) for law in (reaching, ReachingLaw()))
+    return (
+        f"boundary layer {layer:g}, {layer / usual:g} times as thick as usual: the gains (13) that "
+        "the disturbance bounds, such as dry friction, ask for"
+    )
 
 
 def ended(motion: Trajectory, objective: Objective, target: Target | None = None) -> str:
@@ -76,13 +92,14 @@ def motion_report(
     cascade: Cascade | None = None,
     target: Target | None = None,
     words: str = "",
+    reaching: ReachingLaw = ReachingLaw(),
 ) -> RenderableType:
     """Return a simulated motion for the terminal.
 
     ``surface`` is the (first) one, ``run`` the record of ``cascade`` where one was run, ``target``
-    where to, and in ``words``, where that is not x = 0.
+    where to, and in ``words``, where that is not x = 0; ``reaching`` how surfaces are reached.
     """
-    rows = _head(mechanism, objective, start, None if cascade is None else cascade.gate)
+    rows = _head(mechanism, objective, start, None if cascade is None else cascade.gate, reaching)
     if target is not None:
         rows.append(("target", words))
     if run is None:
@@ -218,12 +235,16 @@ def _confidence_row(proposal: Proposal) -> list[tuple[str, str]]:
 
 
 def proposal_report(
-    mechanism: Mechanism, objective: Objective, start: FloatArray, proposal: Proposal
+    mechanism: Mechanism,
+    objective: Objective,
+    start: FloatArray,
+    proposal: Proposal,
+    reaching: ReachingLaw = ReachingLaw(),
 ) -> RenderableType:
     """Return one optimisation's answer for the terminal, with its margins."""
     assert proposal.surface is not None  # require() raises otherwise
     rows = [
-        *_head(mechanism, objective, start),
+        *_head(mechanism, objective, start, reaching=reaching),
         ("surface", _surface_words(proposal.surface)),
         ("predicted cost", f"{proposal.cost:.6g} {objective.unit}"),
         ("status", proposal.status),

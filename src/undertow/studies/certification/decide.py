@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -79,6 +79,14 @@ class Certified:
     seconds: float = 0.0
 
 
+#: Takes what is known of a surface by now.
+Kept = Callable[[Certified], None]
+
+
+def no_keeping(_: Certified) -> None:
+    """Keep nothing."""
+
+
 def certify_surface(
     mechanism: Mechanism,
     surface: Surface,
@@ -92,6 +100,7 @@ def certify_surface(
     hold: int = 0,
     uncertain: Mapping[str, tuple[float, float]] | None = None,
     predict: bool = True,
+    kept: Kept = no_keeping,
     progress: Progress = no_progress,
 ) -> Certified:
     """Decide what can be said of a surface.
@@ -104,7 +113,8 @@ def certify_surface(
     instant). ``uncertain`` plant parameters lie in [low, high] instead of being the law's
     own: for the closed loop with a held input, and for a second region on the surface. ``predict``
     also predicts the motion from the start, and from random ones up to it (sampled). The ``title``
-    is for tables, the surface itself by default.
+    is for tables, the surface itself by default. ``kept`` is called after each decision with all
+    that is known by then: what an interruption leaves.
     """
     began = time.perf_counter()
     most = FIRST + seconds + (2 * loop_seconds if loop else 0.0) + (LAST if predict else 0.0)
@@ -115,9 +125,18 @@ def certify_surface(
 
     tell("stability", 0.0)
     decide = _Decisions(mechanism, surface, reaching_law, start, dict(uncertain or {}))
-    keep = decide.keep
-    keep(*decide.own(StabilityClaim()))
     region = None
+
+    def so_far() -> Certified:
+        subject = Subject(surface, reaching_law, tuple(decide.claims), tuple(decide.remarks))
+        spent = time.perf_counter() - began
+        return Certified(title or str(surface), subject, region, seconds=spent)
+
+    def keep(claim: Claim | None, verdict: Verdict) -> None:
+        decide.keep(claim, verdict)
+        kept(so_far())
+
+    keep(*decide.own(StabilityClaim()))
     if decide.claims:
         tell("terminal set", 0.3 * FIRST)
         keep(*decide.ellipsoid())
@@ -141,12 +160,16 @@ def certify_surface(
             tell("prediction", most - LAST)
             closed = ClosedLoop(mechanism, reaching=reaching_law)
             horizon = closed.objective.horizon
-            remark = assess(closed, Plan.of(surface), start, horizon, GatePolicy())
-            tell("random starts", most - 0.5 * LAST)
-            decide.remarks.extend([remark, *_sampled(closed, surface, start)])
-    subject = Subject(surface, reaching_law, tuple(decide.claims), tuple(decide.remarks))
-    seconds = time.perf_counter() - began
-    return Certified(title or str(surface), subject, region, seconds=seconds)
+            try:
+                decide.remarks.append(
+                    assess(closed, Plan.of(surface), start, horizon, GatePolicy())
+                )
+                tell("random starts", most - 0.5 * LAST)
+                decide.remarks.extend(_sampled(closed, surface, start))
+            except UndertowError as error:  # what is proved stays
+                words = "the predicted motion from the start"
+                decide.remarks.append(Verdict(words, "undecided", method=str(error)))
+    return so_far()
 
 
 def _box(mechanism: Mechanism, start: FloatArray) -> dict[str, tuple[float, float]]:
@@ -305,11 +328,12 @@ def _sampled(loop: ClosedLoop, surface: Surface, start: FloatArray) -> list[Verd
 
 
 def certify_run(
-    mechanism: Mechanism, run: Run, *, progress: Progress = no_progress
+    mechanism: Mechanism, run: Run, *, kept: Kept = no_keeping, progress: Progress = no_progress
 ) -> tuple[Certified, ...]:
     """Decide stability and a terminal set for every surface that a run applied, in order.
 
-    The admissions' verdicts become remarks of the surface that they admitted.
+    The admissions' verdicts become remarks of the surface that they admitted; ``kept`` is as for
+    :func:`certify_surface`.
     """
     seen: dict[Surface, list[Verdict]] = {}
     for update in run.updates:
@@ -320,7 +344,7 @@ def certify_run(
     for surface in each(seen, progress, lambda _: "surfaces of the run"):
         base = certify_surface(
             mechanism, surface, np.zeros(2 * mechanism.n), title=f"surface {len(certified) + 1}",
-            seconds=0.0, predict=False,
+            seconds=0.0, predict=False, kept=kept,
         )  # fmt: skip
         remarks = (*base.subject.remarks, *(v for v in seen[surface] if not v))
         certified.append(replace(base, subject=replace(base.subject, remarks=remarks)))
@@ -335,11 +359,13 @@ def certify_appendix(
     loop_seconds: float = LOOP_SECONDS,
     hold: int = 0,
     uncertain: Mapping[str, tuple[float, float]] | None = None,
+    kept: Kept = no_keeping,
     progress: Progress = no_progress,
 ) -> tuple[Certified, ...]:
     """Decide the appendix's five cases, with a P of our own, for a rotary pendulum.
 
-    ``seconds``, ``loop_seconds``, ``hold`` and ``uncertain`` are as for :func:`certify_surface`.
+    ``seconds``, ``loop_seconds``, ``hold``, ``uncertain`` and ``kept`` are as for
+    :func:`certify_surface`.
     ``loop`` also proves how far off the target the full closed loop may start at rest, up to where
     random starts of the law at every instant, on the plant that it knows, still converge; their
     verdict is a remark. Minutes for each case.
@@ -352,7 +378,7 @@ def certify_appendix(
         start = mechanism.state(phi=float(case.half_width))
         base = certify_surface(
             mechanism, case.surface, start, seconds=seconds, uncertain=uncertain, title=name,
-            predict=False,
+            predict=False, kept=kept,
         )  # fmt: skip
         P, _ = search_rate(case.reduced(constants), case.half_width)
         interval = two_vertex(case.reduced(constants), P, case.half_width)
@@ -370,4 +396,5 @@ def certify_appendix(
                 remarks=(*subject.remarks, *decide.remarks, sampled),
             )
         certified.append(replace(base, subject=subject, interval=interval))
+        kept(certified[-1])
     return tuple(certified)

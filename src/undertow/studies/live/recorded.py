@@ -115,6 +115,7 @@ def recorded_run(
     """
     limits = tuple(mechanism.input_limits.tolist())
     cascade = cascade_for(mechanism, Task(objective, limits, period), seed)
+    cascade.objective.check_start(mechanism, x0)
     radius, away = cascade.objective.terminal_radius, float(np.linalg.norm(x0))
     if away <= radius:
         raise InvalidInputError(
