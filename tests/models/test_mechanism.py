@@ -610,3 +610,25 @@ def test_forces_are_in_the_unit_of_an_input_that_acts_as_it_is(
     made = replace(cart, inputs=inputs, input_matrix=sp.Matrix([[gain]]))
     assert made.force_units == units
     assert made.with_friction(x=0.1).parameters[-1].unit == units[0]
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: ut.Input("F", 10.0), "unit of input 'F': got 10.0, a float"),
+        (lambda: ut.Coordinate("x", "m", -1, 1), "description of coordinate 'x': got -1, an int"),
+        (lambda: ut.Parameter("m", 1.0, None), "unit of parameter 'm': got None, must be text"),
+    ],
+)
+def test_a_number_in_the_place_of_a_text_is_refused(make: Any, words: str) -> None:
+    """A limit in the place of the unit made an actuator without any limit, without a word."""
+    with pytest.raises(ut.UndertowError, match=words) as refusal:
+        make()
+    assert "Write for instance" in str(refusal.value)
+
+
+@pytest.mark.parametrize("name", ["", "  ", "a\nb", "\x1b[2J"])
+def test_a_mechanism_has_a_name_that_can_be_shown(name: str) -> None:
+    """Errors about '' say nothing, and a terminal obeys control characters."""
+    with pytest.raises(ut.UndertowError, match="name of a mechanism"):
+        replace(ut.mechanisms.rotary_pendulum(), name=name)

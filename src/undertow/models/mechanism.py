@@ -159,6 +159,13 @@ class Mechanism:
     def __post_init__(self) -> None:
         """Check shapes, names, symbols and the definiteness of M; freeze the matrices."""
         check_fields(self, "name", "start")
+        if not self.name.strip() or not self.name.isprintable():
+            raise InvalidInputError(
+                "name of a mechanism",
+                value=repr(self.name),
+                limit="a text that can be printed, not empty",
+                remedy="Errors, tables and files name it so",
+            )
         check_parts(self.name, self.coordinates, self.inputs, self.parameters)
         for parts in ("coordinates", "inputs", "parameters"):
             object.__setattr__(self, parts, tuple(getattr(self, parts)))

@@ -148,10 +148,22 @@ class _Named:
         object.__setattr__(self, "spelling", self.name)
         object.__setattr__(self, "name", _name(f"{what} name", self.name))
 
-    def _take_unit(self, unit: object) -> None:
+    def _check_text(self, example: str, *fields: str) -> None:
+        """Refuse numbers and the like in the place of a text: an argument is missing before it."""
+        kind = type(self).__name__
+        for name in fields:
+            given = getattr(self, name)
+            if not isinstance(given, str):
+                raise InvalidInputError(
+                    f"{name} of {kind.lower()} '{self.name}'",
+                    value=f"{'None' if given is None else f'{given!r}, {a_kind(given)}'}",
+                    limit="text",
+                    remedy=f"Write for instance {kind}({self.name!r}, {example})",
+                )
+
+    def _take_unit(self, unit: str) -> None:
         """Keep a unit in its usual spelling: what is usual of a parameter depends on it."""
-        if isinstance(unit, str):
-            object.__setattr__(self, "unit", normal_unit(unit))
+        object.__setattr__(self, "unit", normal_unit(unit))
 
 
 @dataclass(frozen=True)
@@ -192,6 +204,7 @@ class Parameter(_Named):
     def __post_init__(self) -> None:
         """Refuse a value that is not finite or not inside its interval."""
         self._take_name("parameter")
+        self._check_text('1.5, "kg", low=0', "unit", "description", "source")
         self._take_unit(self.unit)
         for end in ("value", "low", "high"):
             given = getattr(self, end)
@@ -262,6 +275,7 @@ class Coordinate(_Named):
     def __post_init__(self) -> None:
         """Refuse an invalid name or unit, and an empty range of travel."""
         self._take_name("coordinate")
+        self._check_text('"m", low=-1, high=1', "unit", "description")
         for end in ("low", "high"):
             number_of(f"{end} end of coordinate '{self.name}'", getattr(self, end))
         whose = f"unit of coordinate '{self.name}'"
@@ -302,6 +316,7 @@ class Input(_Named):
     def __post_init__(self) -> None:
         """Refuse a name that is not an identifier and a limit that is not positive."""
         self._take_name("input")
+        self._check_text('"N", 10.0', "unit")
         self._take_unit(self.unit)
         whose = f"limit of input '{self.name}'"
         remedy = "Give the largest magnitude that the actuator can deliver, in its unit"
