@@ -612,17 +612,24 @@ def test_forces_are_in_the_unit_of_an_input_that_acts_as_it_is(
     assert made.with_friction(x=0.1).parameters[-1].unit == units[0]
 
 
+#: What stands where a text is asked for.
+WRONG: tuple[Any, ...] = (10.0, -1, None)
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: ut.Input("F", 10.0), "unit of input 'F': got 10.0, a float"),
-        (lambda: ut.Coordinate("x", "m", -1, 1), "description of coordinate 'x': got -1, an int"),
-        (lambda: ut.Parameter("m", 1.0, None), "unit of parameter 'm': got None, must be text"),
+        (lambda: ut.Input("F", WRONG[0]), "unit of input 'F': got 10.0, a float"),
+        (
+            lambda: ut.Coordinate("x", "m", WRONG[1], 1),
+            "description of coordinate 'x': got -1, an int",
+        ),
+        (lambda: ut.Parameter("m", 1.0, WRONG[2]), "unit of parameter 'm': got None, must be text"),
     ],
 )
 def test_a_number_in_the_place_of_a_text_is_refused(make: Any, words: str) -> None:
     """A limit in the place of the unit made an actuator without any limit, without a word."""
-    with pytest.raises(ut.UndertowError, match=words) as refusal:
+    with pytest.raises(UndertowError, match=words) as refusal:
         make()
     assert "Write for instance" in str(refusal.value)
 
@@ -630,5 +637,19 @@ def test_a_number_in_the_place_of_a_text_is_refused(make: Any, words: str) -> No
 @pytest.mark.parametrize("name", ["", "  ", "a\nb", "\x1b[2J"])
 def test_a_mechanism_has_a_name_that_can_be_shown(name: str) -> None:
     """Errors about '' say nothing, and a terminal obeys control characters."""
-    with pytest.raises(ut.UndertowError, match="name of a mechanism"):
+    with pytest.raises(UndertowError, match="name of a mechanism"):
         replace(ut.mechanisms.rotary_pendulum(), name=name)
+
+
+def test_a_parameter_of_a_mechanism_without_any_is_told_how_one_is_declared() -> None:
+    """The refusal had read "must be one of ."."""
+    x, y = ut.Coordinate("x", "m"), ut.Coordinate("y", "m")
+    fixed = ut.Mechanism.from_energies(
+        "fixed",
+        [x, y],
+        [ut.Input("F", "N")],
+        kinetic=x.velocity**2 + y.velocity**2,
+        potential=(x.symbol - y.symbol) ** 2,
+    )
+    with pytest.raises(UndertowError, match=r"there are none. .* parameters=\[Parameter"):
+        fixed.with_parameters(m=0.2)

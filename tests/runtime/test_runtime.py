@@ -57,6 +57,15 @@ def settled(controller: Controller, steps: int = 30) -> int:
     return steps
 
 
+def test_a_run_from_hanging_says_that_a_swing_up_is_searched_for() -> None:
+    """Two minutes stood behind "warming up, 0 s left" for a mechanism of one's own."""
+    told: list[str] = []
+    with session(SWINGING, simulated=True, progress=lambda what, _: told.append(what)):
+        pass
+    assert told[0].startswith("swing-up: where none is kept, a search")
+    assert "first optimum" not in told
+
+
 # -- states and guards -----------------------------------------------------------------------
 
 

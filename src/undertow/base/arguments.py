@@ -253,7 +253,8 @@ def one_of(
     known = list(names)
     if name not in known:
         remedy = f"{near(str(name), known)} {remedy}".strip()
-        raise error(what, value=repr(name), limit=f"one of {', '.join(known)}", remedy=remedy)
+        limit = f"one of {', '.join(known)}" if known else "left out: there are none"
+        raise error(what, value=repr(name), limit=limit, remedy=remedy)
 
 
 def check_fields(instance: Any, *names: str) -> None:

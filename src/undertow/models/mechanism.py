@@ -313,6 +313,8 @@ class Mechanism:
         known = [p.name for p in self.parameters]
         values = by_names(f"parameters of '{self.name}'", values)
         remedy = "Use a declared name; values are in SI units"
+        if not known:
+            remedy = "What shall have a value of its own is declared: parameters=[Parameter(...)]"
         for name in values:
             one_of(f"unknown parameter of '{self.name}'", name, known, remedy)
         changed = tuple(

@@ -167,7 +167,8 @@ def session(
             check_resources(processes=0 if simulated else processes, log=log is not None)
             if log is not None:
                 check_log(log)  # before the first optimum, which takes a while
-            tell("first optimum", 0.1)
+            swinging = "swing-up: where none is kept, a search of a minute or more"
+            tell(swinging if recipe.swing_up else "first optimum", 0.1)
             plant = recipe.make_rig() if rig is None else rig
             memory = recipe.first()
             tell("warming up", 0.6)
