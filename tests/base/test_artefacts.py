@@ -171,3 +171,11 @@ def test_a_film_is_not_drawn_for_a_place_where_it_cannot_be(
 def test_a_zero_byte_in_the_name_of_a_folder_is_said(tmp_path: Path) -> None:
     with pytest.raises(ArtefactError, match="got a zero byte in its name"):
         check_folder(tmp_path / "re\0sults")
+
+
+def test_a_folder_in_python_is_not_told_of_an_option_of_the_command_line(tmp_path: Path) -> None:
+    """``ut.export_c`` into a file's place advised ``--out``, which is an option of a command."""
+    (tmp_path / "taken").write_text("here first")
+    with pytest.raises(ArtefactError, match="Name another one") as refusal:
+        write_files(tmp_path / "taken" / "deeper", {"a": b"1"})
+    assert "--" not in str(refusal.value)

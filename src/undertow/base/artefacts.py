@@ -219,15 +219,15 @@ def file_name(name: str) -> str:
     return "".join(c if c.isprintable() else "_" for c in plain)[:100] or "_"
 
 
-def check_folder(folder: Path, option: str = "--out") -> None:
+def check_folder(folder: Path, option: str = "") -> None:
     """Make the folder and prove that it can be written, before any long work.
 
     ``option``: of the command line, by which another one is named. Raises ArtefactError when it
     cannot.
     """
-    refusal = "a folder that can be written", f"Name another one with {option}"
-    what = "results folder" if option == "--out" else f"folder of {option}"
-    with or_refused(f"{what} '{folder}'", *refusal):
+    what = "results folder" if option in ("", "--out") else f"folder of {option}"
+    another = f"Name another one with {option}" if option else "Name another one"
+    with or_refused(f"{what} '{folder}'", "a folder that can be written", another):
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
 
@@ -328,7 +328,7 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> Path | None:
             f"results in '{folder}'",
             value=f"{error.strerror} ({error.filename or folder / name})",
             limit="files that can be written",
-            remedy="Free some space, or name another folder with --out",
+            remedy="Free some space, or name another folder",
         ) from error
     return earlier
 

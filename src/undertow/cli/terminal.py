@@ -324,7 +324,7 @@ def show(*parts: RenderableType, stderr: bool = False, least: int = 0, **how: An
 def check_out(out: Path | None) -> None:
     """Refuse a folder that cannot be written, before any long work."""
     if out is not None:
-        check_folder(out)
+        check_folder(out, "--out")
 
 
 def write(
