@@ -279,6 +279,17 @@ def test_the_furuta_pendulum_from_urdf() -> None:
     assert check_mechanism(read, compiled=False).passed
 
 
+def test_a_joint_that_its_motor_cannot_move_is_refused() -> None:
+    """With more dry friction than the motor has force, a simulation without it had balanced."""
+    for friction, refused in ((19.9, False), (20.1, True)):
+        text = changed(CART_MJCF, 'damping="0.1"', f'damping="0.1" frictionloss="{friction}"')
+        if not refused:
+            assert modelling.from_mjcf(text).disturbance_bounds == (friction, 0.0)
+            continue
+        with pytest.raises(ModelError, match=r"dry friction of joint 'x': got 20.1 N, .* 20 N"):
+            modelling.from_mjcf(text)
+
+
 def test_dry_friction_becomes_a_disturbance_bound() -> None:
     """Claim: friction is no smooth force; it bounds the disturbance of (1) and so the gains."""
     text = CART_URDF.replace('damping="0.001"', 'damping="0.001" friction="0.02"')

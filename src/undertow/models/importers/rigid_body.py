@@ -101,6 +101,7 @@ def mechanism_from_tree(
     index = {joint.name: i for i, joint in enumerate(joints)}
     inputs, B = _inputs(tree, joints, coordinates, index, actuated, effort or {})
     check_underactuated(identifier(tree.name), len(joints), len(inputs))  # before long work
+    _check_moved(joints, inputs, B)
     book = _Book()
     mass, potential = _energies(tree, coordinates, index, book)
     dissipation = sp.Integer(0)
@@ -133,6 +134,23 @@ def mechanism_from_tree(
         description=f"rigid-body tree '{tree.name}'" + _unlimited(inputs),
         source=source,
     )
+
+
+def _check_moved(joints: Sequence[Joint], inputs: Sequence[Input], B: sp.Matrix) -> None:
+    """Refuse a driven joint whose dry friction is more than its inputs can do."""
+    gains = np.abs(np.array(B.tolist(), dtype=float))
+    limits = np.array([channel.limit for channel in inputs])
+    for joint, row in zip(joints, gains, strict=True):
+        driving = row > 0
+        most = float(row[driving] @ limits[driving]) if driving.any() else math.inf
+        if joint.friction >= most:
+            unit = "N m" if joint.kind == "hinge" else "N"
+            raise ModelError(
+                f"dry friction of joint '{joint.name}'",
+                value=f"{joint.friction:g} {unit}",
+                limit=f"less than its inputs can do, {most:g} {unit}",
+                remedy="Nothing would move it: correct the friction or the limit of the input",
+            )
 
 
 def check_held(tree: Tree, actuated: Sequence[str]) -> None:
