@@ -447,6 +447,17 @@ def test_what_is_proved_before_an_interruption_is_kept(
     assert kinds[:2] == ["stability", "terminal ellipsoid"]
 
 
+def test_what_needs_no_start_is_proved_without_one(tmp_path: Path) -> None:
+    """A mechanism of one's own without a usual start was refused, in Python it was not."""
+    (tmp_path / "bare.py").write_text(
+        "from dataclasses import replace\nimport undertow as ut\n"
+        "bare = replace(ut.mechanisms.rotary_pendulum(), start={})\n"
+    )
+    code, out, _ = run("certify", f"{tmp_path}/bare.py:bare", "--seconds", "0")
+    assert code == 0
+    assert "motions on the surface near the target converge" in " ".join(out.split())
+
+
 def test_a_prediction_that_fails_costs_no_proof(monkeypatch: pytest.MonkeyPatch) -> None:
     """Gains too fast for its step ended the command, and with it all that was proved."""
 

@@ -144,7 +144,8 @@ def certify(
     mechanism = task[0] if task else mechanism_named(str(name or "rotary_pendulum"), setting)
     uncertain = _box(mechanism, within)
     if not (run or appendix):
-        x0 = parse_start(mechanism, start)
+        usual = bool(start or mechanism.start)  # without a start there is stability to prove
+        x0 = parse_start(mechanism, start) if usual else mechanism.state()
         used = parse_surface(mechanism, surface) if surface else first_surface(mechanism)
 
     def keep(one: Certified) -> None:
