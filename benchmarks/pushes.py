@@ -76,7 +76,7 @@ def main() -> int:
     parser = command_line(__doc__, "--names rotary_pendulum --sizes 0 2 5 --clock cpu")
     parser.add_argument("--names", nargs="+", default=list(NAMES), help="mechanisms")
     parser.add_argument("--sizes", nargs="+", type=float, default=[0.0, 1.0, 3.0, 10.0],
-                        help="pushes, % of the largest rate of each joint (0 1 3 10)")  # fmt: skip
+                        help="pushes, %% of the largest rate of each joint (0 1 3 10)")  # fmt: skip
     options = parser.parse_args()
     names = options.names[:1] if options.quick else options.names
     now, rng = clock(options.clock), np.random.default_rng(0)

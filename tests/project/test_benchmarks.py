@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import shutil
 import subprocess
 import sys
+from collections import defaultdict
 from pathlib import Path
 from types import ModuleType
 
@@ -62,6 +64,16 @@ def test_the_one_command_knows_every_benchmark() -> None:
     assert "examples:" in shown.stdout
     words = shown.stdout.replace(",", " ").split()
     assert set(SCRIPTS) - HELPERS <= set(words)
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_the_help_of_every_option_can_be_printed(script: str) -> None:
+    """argparse formats it with %: a per cent sign of its own is doubled."""
+    tree = ast.parse((FOLDER / f"{script}.py").read_text(encoding="utf-8"))
+    for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
+        for given in call.keywords:
+            if given.arg == "help" and isinstance(given.value, ast.Constant):
+                assert str(given.value.value) % defaultdict(int)
 
 
 def test_an_unknown_benchmark_is_refused_with_the_known_ones() -> None:

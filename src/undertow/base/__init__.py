@@ -1,4 +1,4 @@
-"""What every other package stands on: checks of arguments, errors, verdicts, files and tables."""
+"""Used by every other package: checks of arguments, errors, verdicts, files and tables."""
 
 from undertow.base.interrupt import (
     INTERRUPTED,

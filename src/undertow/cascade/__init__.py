@@ -1,11 +1,10 @@
 """The cascade: the law inside, the optimiser outside, a gate between; and swing-up before it.
 
-Begin at :class:`Cascade` (:mod:`.cascade`), which remembers a :class:`CascadeState`. What it
-predicts with is in :mod:`.predictions`, whom it asks for plans in :mod:`.planners`, how in
-:mod:`.planning`; :mod:`.judge` decides what is admitted, and falls back on :mod:`.reserve`. What a
-simulated run is made of is in :mod:`.simulation`, targets that lie elsewhere in :mod:`.targets`;
-:mod:`.robustness` asks what delay and noise a surface bears, :mod:`.swing_up` brings the mechanism
-up first.
+Begin at :class:`Cascade` (:mod:`.cascade`), whose memory is a :class:`CascadeState`. It predicts
+with :mod:`.predictions` and obtains plans from :mod:`.planners`, by way of :mod:`.planning`;
+:mod:`.judge` decides what is admitted, and falls back on :mod:`.reserve`. Simulated runs are in
+:mod:`.simulation`, targets other than x = 0 in :mod:`.targets`, the delay and noise that a surface
+bears in :mod:`.robustness`, swing-up in :mod:`.swing_up`.
 """
 
 from undertow.cascade.cascade import Cascade

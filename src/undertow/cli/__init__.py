@@ -59,7 +59,7 @@ def _version(asked: bool) -> None:
 
 @app.callback(
     epilog=folded(
-        "undertow show rotary_pendulum             # watch it live, poke it",
+        "undertow show rotary_pendulum             # watch it live, push it",
         "undertow simulate rotary_pendulum         # balance it, with numbers",
         "undertow mechanisms                       # what else there is",
         "undertow doctor                           # what is installed, and a test",

@@ -40,7 +40,7 @@ def campaign(
     picture: Path | None = None,
     proof: Path | None = None,
 ) -> None:
-    """Compute many shards of work, and keep them in a store that survives interruptions.
+    """Run a campaign: maps, random plants, designs or the league, in a store that can be resumed.
 
     Parameters
     ----------
@@ -51,20 +51,20 @@ def campaign(
     mechanism
         Mechanism instead of the file's; the only way to name FILE.py:NAME, which is run.
     entrant
-        Controller of your own for a league, FILE.py:NAME, which is run; repeatable.
+        Controller of your own for a league, FILE.py:NAME, which is run. Repeatable.
     threads
         Threads of this process.
     workers
-        Processes on this machine instead, dask's; extra campaign.
+        Processes of dask on this machine instead; needs the extra campaign.
     scheduler
         Address of a dask scheduler instead, which must see the same folder.
     limit
         Time after which a worker's shard counts as hanging, s; needs --workers or --scheduler, for
         a thread cannot be ended.
     resume
-        Go on with the store that is there.
+        Resume the existing store.
     status
-        Show how far it is, and nothing else.
+        Show the progress, and nothing else.
     shard
         Compute this shard alone, in this process, and compare it with the store.
     tables

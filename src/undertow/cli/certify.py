@@ -108,8 +108,8 @@ def certify(
     hold
         With --loop: how long the input is held, whole ms; 0 is a continuous input.
     within : NAME=PERCENT
-        A parameter of the plant that the law knows to so many per cent only: for the region on the
-        surface once more, and for the loop. Repeatable.
+        A parameter of the plant that is known only to within so many per cent: the region on the
+        surface is proved once more with it, and the loop. Repeatable.
     out
         Folder for certificate.json and the figures.
     """

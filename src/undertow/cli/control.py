@@ -200,7 +200,7 @@ def optimise(
     Parameters
     ----------
     evaluations
-        Largest number of rollouts of the search; by default as it needs.
+        Largest number of rollouts of the search. Default: as many as it needs.
     out
         Folder for proposal.json.
     """

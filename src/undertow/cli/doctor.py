@@ -8,7 +8,7 @@ from undertow.cli.terminal import command, exit_unless, progress_bar, show
 
 @command("undertow doctor", "undertow doctor --no-test")
 def doctor(test: bool = True) -> None:
-    """Tell what is installed, what each extra would add, and test that it works here.
+    """Report what is installed and what each extra would add, and test that it works here.
 
     Exit status 1 when a test fails.
 

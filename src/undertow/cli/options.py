@@ -88,9 +88,9 @@ Target = Annotated[
         "--target",
         "Where to, with units. x=1m: a set-point; x=-1m@2s: another one from 2 s on; "
         "theta=45deg@0.5Hz: a sine; FILE.csv: a path through its points, 't (s), x (m)' in its "
-        "first line. Repeatable. Default: x = 0. On a rig a set-point is gone to as soon as there "
-        "is a plan for it. For a URDF or MJCF file also upright, hanging, nearest or JOINT=180deg: "
-        "the equilibrium that is x = 0.",
+        "first line. Repeatable. Default: x = 0. On a rig a set-point takes effect as soon as "
+        "there is a plan for it. For a URDF or MJCF file also upright, hanging, nearest or "
+        "JOINT=180deg: the equilibrium that is x = 0.",
         metavar="STATE=VALUE[@TIME]|FILE.csv",
     ),
 ]

@@ -286,7 +286,7 @@ def _say_where_to_ask(log: Path, deaf: str, free: Sequence[Coordinate]) -> None:
     "undertow target run.db",
 )
 def target(log: Path, points: Annotated[list[str] | None, typer.Argument()] = None) -> None:
-    """Give a run that goes on another target.
+    """Give a run in progress another target.
 
     The run, started with --log in another terminal of this machine, checks
     the target first. One where it cannot rest, or past its travel, is refused
@@ -296,7 +296,7 @@ def target(log: Path, points: Annotated[list[str] | None, typer.Argument()] = No
     Parameters
     ----------
     log : LOG
-        Log of a run that goes on.
+        Log of a run in progress.
     points : STATE=VALUE[@TIME]
         Set-points, with units: x=1m, or x=-1m@8s for 8 s from now. They take the place of those
         that are not reached yet; coordinates that are not named stay where the target is. Without

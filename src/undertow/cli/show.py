@@ -69,7 +69,7 @@ def show(
         typer.Argument(
             help=f"Mechanism of the library, or your own: FILE.py:NAME, {file_words()}, with "
             ":JOINT,JOINT for the actuated joints where the file does not name them; or the log "
-            "of a run, FILE.db, also of one that goes on.",
+            "of a run, FILE.db, also of one in progress.",
             metavar="NAME|LOG",
         ),
     ] = "rotary_pendulum",
@@ -86,7 +86,7 @@ def show(
 ) -> None:
     """Show a mechanism and its controller on a live page, on this machine alone.
 
-    Poke it with the mouse, change its plant and its target, watch the surface jump. Ctrl-C ends it.
+    Pull it with the mouse, change its plant and its target, watch the surface jump. Ctrl-C ends it.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""What is best: stage cost, horizon, terminal set and constraints; a word for each usual problem.
+"""Objectives: stage cost, horizon, terminal set and constraints; names for the usual ones.
 
-:class:`Objective` (:mod:`.objective`) takes a cost of your own; :mod:`.named` gives words a
-meaning.
+:class:`Objective` (:mod:`.objective`) takes a cost of your own; :mod:`.named` has those that
+commands know by name.
 """
 
 from undertow.objective.named import USUAL, Goal, finite_limits, objective_for

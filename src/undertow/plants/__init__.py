@@ -1,4 +1,4 @@
-"""Rigs, what a controller meets: read, write, close.
+"""Rigs, simulated or real: what a controller reads, writes and closes.
 
 :mod:`.interface` says what a rig is; hardware of one's own implements it. :mod:`.simulated` has
 the ideal model and the realistic bench, whose imperfections are the data of :mod:`.bench`;

@@ -4,9 +4,9 @@ A run is data (:mod:`.recipe`), and :mod:`.session` carries it out. The fast loo
 reads, asks the :mod:`.controller` what to do, writes and logs; the controller, a pure state
 machine, checks its readings (:mod:`.sensors`), steps (:mod:`.steps`, :mod:`.modes`) and looks at
 each plan before it uses it (:mod:`.plan_check`). The slow loop (:mod:`.slow_loop`) selects plans,
-in a thread or in processes (:mod:`.workers`). :mod:`.supervisor` outlives them all. What was
-logged (:mod:`.log`, columns in :mod:`.encoding`) is read by :mod:`.recording` and run again, bit
-for bit, by :mod:`.replay`.
+in a thread or in processes (:mod:`.workers`). :mod:`.supervisor`, in a process of its own, sets
+the output to zero when the controller hangs or dies. What was logged (:mod:`.log`, columns in
+:mod:`.encoding`) is read by :mod:`.recording` and run again, bit for bit, by :mod:`.replay`.
 """
 
 from undertow.runtime.clock import Histogram, SimulatedClock, WallClock
