@@ -299,10 +299,11 @@ def estimate(h, q, u, block, size, room, known, delayed):
             share[i] = 1.0 / repeated(counts[i], h, x[n + i], P[n + i, n + i], new)
     if readings_after_jump(x, P, q, now, h, knock, odd, taken):
         odd[3] = {SETTLES}
+    surely = learnt  # so many numbers are moved by all that a reading says
     if odd[3] > 0.0:
-        share[:] = 0.0
+        share[:], surely = 0.0, learnt - delayed
         odd[3] = odd[3] - h
-    measurement_update(x, P, taken[:n], now, total, learnt, share)
+    measurement_update(x, P, taken[:n], now, total, surely, share)
     if delayed:
         x[learnt - 1] = max(-told[0], min(told[2], x[learnt - 1]))
     for i in range(m if disturbed else 0):
