@@ -11,8 +11,9 @@ from undertow.base import InvalidInputError
 from undertow.closed_loop import ClosedLoop
 from undertow.estimators import Belief, KalmanFilter
 from undertow.law import InnerLoop
+from undertow.mechanisms.named import named
 from undertow.models import FloatArray, Mechanism
-from undertow.plants import Bench, Encoder, IdealRig, Measurement, RealisticRig
+from undertow.plants import Bench, Encoder, Friction, IdealRig, Measurement, RealisticRig
 
 PERIOD, NOISE = 0.001, 2e-4
 
@@ -332,3 +333,79 @@ def test_counts_of_a_joint_that_runs_are_white_noise(arm: Mechanism) -> None:
             states.append(kalman.estimate(Measurement(k * PERIOD, q), np.zeros(1)).copy())
     np.testing.assert_allclose(states[:50], states[50:], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(both[0].noise_covariance(), both[1].noise_covariance(), rtol=1e-9)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.0045, 0.009, 0.016])
+@pytest.mark.parametrize("name", ["rotary_pendulum", "cart_pendulum", "overhead_crane"])
+def test_a_delay_that_nobody_told_is_found(name: str, late: float) -> None:
+    """Within 3 ms after half a second, of a rig with encoders that is later than was told."""
+    model = named(name)
+    counts = {c.name: Encoder(2e-4) for c in model.coordinates}
+    bench = Bench(model, encoders=counts).with_delay(0.001 + late)
+    rig = RealisticRig(bench, 0.5 * model.usual_start, 3)
+    kalman = KalmanFilter(
+        model, PERIOD, position_noise=1e-6, resolution=2e-4, acceleration_noise=0.1,
+        delay=0.001, delay_tolerance=0.004,
+    )  # fmt: skip
+    law = InnerLoop(model, ut.first_surface(model))
+    kalman.reset(0.5 * model.usual_start)
+    rng, u, shake = np.random.default_rng(1), np.zeros(model.m), np.zeros(model.m)
+    limits = np.minimum(model.input_limits, 1e3)
+    for k in range(500):
+        seen = rig.read()
+        x = kalman.estimate(seen, u)
+        if k % 20 == 0:
+            shake = 0.1 * limits * rng.uniform(-1.0, 1.0, model.m)
+        u = np.clip(law(x) + shake, -limits, limits)
+        rig.write(u)
+    assert abs(kalman.delay - 0.001 - late) < 0.003
+    kalman.reset(np.zeros(2 * model.n))
+    assert kalman.delay == 0.001
+
+
+def test_how_soon_the_motion_answers_is_the_derivative_by_the_delay(arm: Mechanism) -> None:
+    """Of a mean that goes on for a sample with a delay, against two filters of other delays."""
+    inputs = 8.0 * np.sin(0.1 * np.arange(30))
+
+    def gone_on(late: float) -> FloatArray:
+        """Where the states are that a filter with that delay, of whole periods, predicts."""
+        kalman = KalmanFilter(arm, PERIOD, position_noise=NOISE, delay=late)
+        kalman.reset(arm.state(phi=0.2))
+        for k, u in enumerate(inputs):
+            kalman.estimate(Measurement(k * PERIOD, np.full(2, np.nan)), np.array([u]))
+        return kalman._x[:4].copy()
+
+    free = KalmanFilter(arm, PERIOD, position_noise=NOISE, delay=0.003, delay_tolerance=1e-6)
+    free.reset(arm.state(phi=0.2))
+    for k, u in enumerate(inputs):
+        free.estimate(Measurement(k * PERIOD, np.full(2, np.nan)), np.array([u]))
+    slope = (gone_on(0.004) - gone_on(0.003)) / PERIOD
+    tells = free.covariance[:4, 4] / free.covariance[4, 4]  # ∂x/∂τ, drift besides
+    np.testing.assert_allclose(tells, slope, rtol=0.02)
+
+
+@pytest.mark.parametrize("volts", [1.0, 3.0])
+def test_dry_friction_that_turns_over_is_followed(arm: Mechanism, volts: float) -> None:
+    """30 ms after the arm has turned the disturbance has the sign of what resists."""
+    friction = volts * arm.parameter_values[[p.name for p in arm.parameters].index("a_e")]
+    bench = Bench(arm, friction={"theta": Friction(coulomb=float(friction))})
+    rig = RealisticRig(bench, np.zeros(4), 2)
+    kalman = KalmanFilter(
+        arm, PERIOD, position_noise=NOISE, disturbance_drift=1.5, belief=Belief.usual(arm)
+    )
+    kalman.reset(np.zeros(4))
+    u, turned, right, seen_turns = np.zeros(1), -1.0, 0, 0
+    before = 0.0
+    for k in range(4000):
+        kalman.estimate(rig.read(), u)
+        u = np.array([8.0 * np.sin(2 * np.pi * 1.5 * k * PERIOD)])
+        rig.write(u)
+        speed = rig.truth[2]
+        if k > 1500 and speed * before < 0.0:
+            turned = k * PERIOD
+        before = speed or before
+        if turned > 0.0 and abs(k * PERIOD - turned - 0.030) < 0.5 * PERIOD:
+            seen_turns += 1
+            right += kalman.disturbance[0] * speed < 0.0
+    assert seen_turns >= 5
+    assert right >= seen_turns - 1

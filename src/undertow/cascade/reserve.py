@@ -20,8 +20,25 @@ STRONGER = (1.0, 2.0, 4.0, 8.0)
 ROOM = 0.8
 
 #: Impulses after which plans are compared, on each coordinate and either way: parts of what would
-#: carry it, at the rate of the fastest mode, as far as the start is.
-JUMPS = (0.25, 0.5, 1.0)
+#: carry it, at the rate of the fastest mode, as far as the start is.  No plan bears the largest.
+JUMPS = (0.25, 0.5, 1.0, 2.0, 4.0)
+
+
+def ever_stronger(plan: Plan, reaching: ReachingLaw) -> tuple[Plan, ...]:
+    """Return a plan with its reaching gains and layers ``STRONGER`` times, those of ``reaching``
+    where it has none of its own."""
+    m = plan.surfaces[0].m
+    gains = [(law, *law.per_surface(m)) for law in plan.laws(reaching)]
+    return tuple(
+        replace(
+            plan,
+            reaching=tuple(
+                replace(law, eta=tuple(c * eta), layer=tuple(c * layer))
+                for law, eta, layer in gains
+            ),
+        )
+        for c in STRONGER
+    )
 
 
 class Reserve:
@@ -42,9 +59,7 @@ class Reserve:
 
     def __init__(self, first: Surface, reaching: ReachingLaw, period: float) -> None:
         self.reaching, self.period = reaching, period
-        eta, layer = reaching.per_surface(first.m)
-        laws = [replace(reaching, eta=tuple(c * eta), layer=tuple(c * layer)) for c in STRONGER]
-        self.plans = tuple(Plan((first,), (0.0,), (law,)) for law in laws)
+        self.plans = ever_stronger(Plan.of(first), reaching)
         self._better = lru_cache(maxsize=2)(self._compare)
 
     def better(
@@ -69,7 +84,8 @@ class Reserve:
         return self.plans[best - 1] if best else None
 
     def after_jump(self, loop: ClosedLoop, first: Plan, error: FloatArray) -> Plan:
-        """The plan to go on with when velocities have jumped: the first optimum, or one of these.
+        """The plan to go on with when velocities have jumped: one of these, or the first optimum
+        as it is or reached more strongly.
 
         It is the one that brings home from most of the ``JUMPS`` at rest, and of those the cheapest
         in sum.  The plan in use is none of them: at rest that was chosen for hardly any cost, and
@@ -83,7 +99,8 @@ class Reserve:
         jump = mechanism.linearise().fastest * far * (inverse / np.diag(inverse)).T
         knocks = np.zeros((2 * len(JUMPS) * n, 2 * n))
         knocks[:, n:] = np.vstack([sign * part * jump for part in JUMPS for sign in (1, -1)])
-        plans, span = [*reversed(self.plans), first], loop.objective.horizon
+        plans = [*reversed(self.plans), *ever_stronger(first, self.reaching)]
+        span = loop.objective.horizon
         ranks = []
         for plan in plans:
             scores = loop.batch(knocks, plan).score(span)

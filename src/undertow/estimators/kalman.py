@@ -10,9 +10,14 @@ belief says that they are uncertain, parameters: the filter moves with what it h
 A knock changes velocities at once, which no parameter explains.  A reading that is off by more than
 the filter's own statistics allow is left out, if it is the only one in a row: it was bad.  The next
 one means that the velocities have jumped: their covariance takes in as large a jump as the readings
-show, and parameters are not learnt from that sample (a test of the innovations, and a reset of the
+show, and parameters are not learnt for a while (a test of the innovations, and a reset of the
 covariance; Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation*,
 2001, 11.6).
+
+A delay τ that is not known for sure is estimated, too: inputs change all the time, and how soon the
+motion shows it tells when they act (∂q̈/∂τ = −∂q̈/∂u u̇).  Dry friction turns over with its joint,
+which looks like a delay as well: at such a turn the variance of the disturbance takes in twice what
+is felt of it.
 
 An encoder's error is no white noise: while a joint moves by less than a count, one reading after
 the other has the same.  Of parameters, which add up what each reading says, so many of them say no
@@ -47,9 +52,8 @@ from undertow.symbolic import BRIEF, COMPILED, Workspace, numba, unpacked
 
 #: Parameters are learnt while some acceleration is larger than this part of what the full inputs do
 #: to it at the target, and than what the estimated disturbance does besides: what the model leaves
-#: out, dry friction, is small beside it.  And than what the inputs have changed by in the last few
-#: ms: with a delay that the model leaves out they do not act yet, as if the masses were larger.
-EXCITED, LATE = 0.1, 0.006
+#: out, dry friction, is small beside it.
+EXCITED = 0.1
 
 #: Standard deviation of a matched disturbance before anything moves, as a part of the input's
 #: limit: half of it, two deviations, is what a controller makes up for.  With less, dry friction
@@ -62,6 +66,9 @@ AVERAGED = 1.0
 #: Standard deviations beyond which an innovation is none of noise and model: of 10⁹ samples that
 #: are, two.
 JUMP = 6.0
+
+#: Time after a jump in which no parameters are learnt, s: the velocities have to be found first.
+SETTLES = 0.02
 
 #: A jump of a velocity is a knock, after which what was planned is for another motion, if the full
 #: inputs take longer than this for as much, s.  What is less is not told from a delay or friction
@@ -172,15 +179,26 @@ def readings_after_jump(
     return True
 
 
-#: What the filter remembers: ``size`` numbers are estimated, the last ``known`` of them offsets of
-#: parameters, in tolerances; inputs act ``lead`` periods late; ``fastest``: rate of a mode, 1/s.
+#: Density of the drift of an estimated delay, in its tolerances per √s, and how many of them it is
+#: longer at most than it was told.
+DELAY_DRIFT, LONGEST = 0.25, 8.0
+
+#: A joint has turned when its velocity is so many standard deviations the other way; the variance
+#: of a disturbance at it takes in (so many times its size)², then.
+TURNED, REVERSED = 2.0, 2.0
+
+#: What the filter remembers: ``size`` numbers are estimated, state, disturbance, delay, and the
+#: last ``known`` of them offsets of parameters, in tolerances; ``past``: inputs of the last
+#: ``room`` periods; ``told``: delay, period and what the delay is longer at most, s; ``fastest``:
+#: rate of a mode, 1/s.
 _LAYOUT = {
     "x": "size", "out": "size", "noise": "size", "variance": "n", "limits": "m",
     "counts": "n", "late": "1", "now": "n", "share": "n",
-    "parameters": "p", "count": "1", "past": "lead + 1, m", "P": "size, size",
-    "F": "size, size", "A": "size, size", "work": "7, size", "odd": "3",
+    "parameters": "p", "count": "1", "past": "room, m", "P": "size, size",
+    "F": "size, size", "A": "size, size", "work": "9, size", "odd": "4",
     "place": "known", "nominal": "known", "tolerance": "known", "reach": "known",
-    "excited": "n", "knock": "n", "last": "m", "stirred": "1", "felt": "m", "fastest": "1",
+    "excited": "n", "knock": "n", "felt": "m", "fastest": "1",
+    "told": "3", "way": "m",
 }  # fmt: skip
 
 _BODY = f"""
@@ -194,7 +212,7 @@ def move(h, x, u, n, m, disturbed, parameters, stage, total, qdd, viscous, drive
 
 {COMPILED}
 def jacobian(
-    h, x, u, n, m, disturbed, parameters, place, tolerance, F, A, qdd, base, viscous, driven
+    h, x, u, change, n, m, disturbed, parameters, place, tolerance, F, A, qdd, base, viscous, driven
 ):
     # I + hA + h²A²/2, A by differences of the accelerations.
     size = x.shape[0]
@@ -218,11 +236,17 @@ def jacobian(
             parameters[at] = kept + small * tolerance[j - learnt]
             forward(0.0, x, driven, viscous, parameters, qdd)
             parameters[at] = kept
-        else:
+        elif disturbed and j < 2 * n + m:
             kept = driven[j - 2 * n]
             driven[j - 2 * n] = kept + small
             forward(0.0, x, driven, viscous, parameters, qdd)
             driven[j - 2 * n] = kept
+        else:  # the delay
+            for i in range(m):
+                driven[i] = driven[i] + small * change[i]
+            forward(0.0, x, driven, viscous, parameters, qdd)
+            for i in range(m):
+                driven[i] = driven[i] - small * change[i]
         for i in range(n):
             A[n + i, j] = (qdd[i] - base[i]) / small
     for i in range(size):
@@ -234,34 +258,37 @@ def jacobian(
 
 
 {BRIEF}
-def estimate(h, q, u, block, size, lead, known):
+def estimate(h, q, u, block, size, room, known, delayed):
 {unpacked(_LAYOUT)}
     learnt = size - known
-    disturbed = learnt > 2 * n
+    disturbed = learnt - delayed > 2 * n
     start = int(count[0])
-    stage, total, qdd, base, viscous, driven, taken = (
-        work[0], work[1], work[2], work[3], work[4], work[5], work[6]
+    stage, total, qdd, base, viscous, driven, taken, acting, change = (
+        work[0], work[1], work[2], work[3], work[4], work[5], work[6], work[7], work[8]
     )
-    changed = 0.0
     for i in range(m):
-        clipped = max(-limits[i], min(limits[i], u[i]))
-        changed = max(changed, abs(clipped - last[i]) / limits[i])
-        past[start % (lead + 1), i] = last[i] = clipped
-    stirred[0] = stirred[0] * max(0.0, 1.0 - h / {LATE}) + changed
-    then = past[(start + 1) % (lead + 1)]
+        past[start % room, i] = max(-limits[i], min(limits[i], u[i]))
+    period = told[1]
+    wait = (told[0] + (x[learnt - 1] if delayed else 0.0)) / period
+    whole = int(wait + 1e-6)
+    rest = max(0.0, wait - whole)  # of a period, during which the input before acts
+    for i in range(m):
+        newer, older = past[(start - whole) % room, i], past[(start - whole - 1) % room, i]
+        acting[i] = newer + rest * (older - newer)
+        change[i] = (older - newer) / period
     parts = max(1, math.ceil(h * fastest[0] - 1e-9))  # of a period: short beside the fastest mode
     part = h / parts
     for _ in range(parts):
         jacobian(
-            part, x, then, n, m, disturbed, parameters, place, tolerance, F, A, qdd, base, viscous,
-            driven
+            part, x, acting, change, n, m, disturbed, parameters, place, tolerance, F, A, qdd, base,
+            viscous, driven
         )
-        move(part, x, then, n, m, disturbed, parameters, stage, total, qdd, viscous, driven)
+        move(part, x, acting, n, m, disturbed, parameters, stage, total, qdd, viscous, driven)
         moving, louder = learnt, 0.0
         for i in range(m if disturbed else 0):
             louder = max(louder, abs(x[2 * n + i]) / limits[i])
         for i in range(n):
-            if abs(base[i]) > excited[i] * (1.0 + (stirred[0] + louder) / {EXCITED}):
+            if abs(base[i]) > excited[i] * (1.0 + louder / {EXCITED}):
                 moving = size
         predict_covariance(F, P, A, noise, part, moving)
     for i in range(n):
@@ -271,8 +298,19 @@ def estimate(h, q, u, block, size, lead, known):
             new = now[i] - counts[i] * counts[i] / 12.0
             share[i] = 1.0 / repeated(counts[i], h, x[n + i], P[n + i, n + i], new)
     if readings_after_jump(x, P, q, now, h, knock, odd, taken):
-        share[:] = 0.0
-    measurement_update(x, P, taken[:n], now, total, learnt, share)
+        odd[3] = {SETTLES}
+    surely = learnt  # so many numbers are moved by all that a reading says
+    if odd[3] > 0.0:
+        share[:], surely = 0.0, learnt - delayed
+        odd[3] = odd[3] - h
+    measurement_update(x, P, taken[:n], now, total, surely, share)
+    if delayed:
+        x[learnt - 1] = max(-told[0], min(told[2], x[learnt - 1]))
+    for i in range(m if disturbed else 0):
+        if x[n + i] ** 2 > {TURNED**2} * P[n + i, n + i]:
+            if x[n + i] * way[i] < 0.0:
+                P[2 * n + i, 2 * n + i] = P[2 * n + i, 2 * n + i] + ({REVERSED} * felt[i]) ** 2
+            way[i] = x[n + i]
     for j in range(known):
         x[learnt + j] = max(-reach[j], min(reach[j], x[learnt + j]))
         parameters[int(place[j])] = nominal[j] + tolerance[j] * x[learnt + j]
@@ -281,10 +319,15 @@ def estimate(h, q, u, block, size, lead, known):
     count[0] = start + 1.0
     for i in range(x.shape[0]):
         out[i] = x[i]
-    for k in range(lead):
-        then = past[(start + 2 + k) % (lead + 1)]
-        for _ in range(parts):
-            move(part, out, then, n, m, disturbed, parameters, stage, total, qdd, viscous, driven)
+    for k in range(whole + 1):
+        span = period * (1.0 if k else rest)
+        then = past[(start - whole + k) % room]
+        parts = math.ceil(span * fastest[0] - 1e-9) if span * fastest[0] > 1.0 else 1
+        for _ in range(parts if span > 0.0 else 0):
+            move(
+                span / parts, out, then, n, m, disturbed, parameters, stage, total, qdd, viscous,
+                driven
+            )
 """
 
 
@@ -323,6 +366,9 @@ class KalmanFilter(Estimator):
     delay
         Known delay of measurement and input together, s, rounded to periods: the estimate is
         for the moment when the answer to it acts.
+    delay_tolerance
+        Standard deviation of that delay, s, which is then estimated, too: from none to 8 of them
+        longer than it is told; 0: it is exact.
     belief
         What is not known of the mechanism's parameters, which are then estimated with the state;
         ``None``: they are exact.  A belief with a bound is refused: a covariance rules nothing out.
@@ -365,6 +411,7 @@ class KalmanFilter(Estimator):
         time_noise: float = 0.0,
         disturbance_drift: float = 0.0,
         delay: float = 0.0,
+        delay_tolerance: float = 0.0,
         belief: Belief | None = None,
         parameter_drift: float = 0.1,
     ) -> None:
@@ -376,8 +423,9 @@ class KalmanFilter(Estimator):
         super().__init__(mechanism, period)
         n, m = mechanism.n, mechanism.m
         positive(
-            "time_noise, disturbance_drift, delay and parameter_drift of a Kalman filter",
-            (time_noise, disturbance_drift, delay, parameter_drift),
+            "time_noise, disturbance_drift, delay, delay_tolerance and parameter_drift of a "
+            "Kalman filter",
+            (time_noise, disturbance_drift, delay, delay_tolerance, parameter_drift),
             "0 turns each off",
             zero=True,
         )
@@ -399,21 +447,26 @@ class KalmanFilter(Estimator):
             "mechanism": mechanism, "period": period, "position_noise": position_noise,
             "acceleration_noise": acceleration_noise, "resolution": resolution,
             "time_noise": time_noise, "disturbance_drift": disturbance_drift,
-            "delay": delay, "belief": belief, "parameter_drift": parameter_drift,
+            "delay": delay, "delay_tolerance": delay_tolerance, "belief": belief,
+            "parameter_drift": parameter_drift,
         }  # fmt: skip
         self._known = known = 0 if belief is None else len(belief.tolerances)
-        self._learnt = 2 * n + (m if disturbance_drift > 0 else 0)
+        self._moved = 2 * n + (m if disturbance_drift > 0 else 0)
+        self._delayed = int(delay_tolerance > 0)
+        self._learnt = self._moved + self._delayed
         size = self._learnt + known
         self._size, self._lead = size, round(delay / period)
+        longest = LONGEST * delay_tolerance
+        self._room = self._lead + math.ceil(longest / period) + 2
         memory = Workspace(
-            _LAYOUT, n=n, m=m, p=len(mechanism.parameters), size=size, lead=self._lead, known=known
+            _LAYOUT, n=n, m=m, p=len(mechanism.parameters), size=size, room=self._room, known=known
         )
+        memory["told"][:] = self._lead * period, period, longest
         self._block, self._count, self._past = memory.block, memory["count"], memory["past"]
         self._x, self._out = memory["x"], memory["out"]
         self._P: FloatArray = memory["P"]
         self._odd: FloatArray = memory["odd"]
-        self._last, self._stirred = memory["last"], memory["stirred"]
-        self.felt = memory["felt"]
+        self.felt, self._way = memory["felt"], memory["way"]
         self._variance, self._F = memory["variance"], memory["F"]
         counts = memory["counts"]
         counts[:] = one_for_each("resolution", resolution, n, zero=True)
@@ -423,7 +476,9 @@ class KalmanFilter(Estimator):
         self._parts = max(1, math.ceil(period * memory["fastest"][0] - 1e-9))
         unknown = one_for_each("acceleration_noise", acceleration_noise, n)
         memory["noise"][n : 2 * n] = unknown**2
-        memory["noise"][2 * n : self._learnt] = disturbance_drift**2
+        memory["noise"][2 * n : self._moved] = disturbance_drift**2
+        memory["noise"][self._moved : self._learnt] = (DELAY_DRIFT * delay_tolerance) ** 2
+        self._delay_variance = delay_tolerance**2
         memory["limits"][:] = self._limits = mechanism.input_limits
         full = full_accelerations(mechanism)
         memory["knock"][:] = KNOCK * full
@@ -438,7 +493,7 @@ class KalmanFilter(Estimator):
         self.belief = belief
         self._state: FloatArray = self._out[: 2 * n]
         if disturbance_drift > 0:
-            self.disturbance = self._x[2 * n : self._learnt]
+            self.disturbance = self._x[2 * n : self._moved]
         self._estimate = _module(mechanism).estimate
         self.reset(np.zeros(2 * n))
 
@@ -447,36 +502,43 @@ class KalmanFilter(Estimator):
 
         ``spread`` is the standard deviation of the velocities, rad/s or m/s; that of the
         positions is a measurement's, that of the disturbance a quarter of its limit.  What was
-        learnt of parameters is forgotten.
+        learnt of parameters and of the delay is forgotten.
         """
-        n, learnt = self.mechanism.n, self._learnt
+        n, moved, learnt = self.mechanism.n, self._moved, self._learnt
         self._x[:] = 0.0
         self._x[: 2 * n] = x0
         self._P[:] = 0.0
         variances = np.zeros(len(self._x))
         variances[:n], variances[n : 2 * n] = self._variance, spread**2
-        if learnt > 2 * n:
+        if moved > 2 * n:
             known = np.isfinite(self._limits)
-            variances[2 * n : learnt] = np.where(known, DISTURBED * self._limits, 1.0) ** 2
+            variances[2 * n : moved] = np.where(known, DISTURBED * self._limits, 1.0) ** 2
+        variances[moved:learnt] = self._delay_variance
         variances[learnt:] = EVEN**2
         np.fill_diagonal(self._P, variances)
         self.parameters[:] = self.mechanism.parameter_values
         self._past[:], self._count[0], self._t = 0.0, 0, math.nan
-        self._last[:], self._stirred[0] = 0.0, 0.0
-        self._odd[:] = self.felt[:] = 0.0
+        self._odd[:] = self.felt[:] = self._way[:] = 0.0
         self._out[:] = self._x
 
     def estimate(self, measurement: Measurement, u: FloatArray) -> FloatArray:
         """Return the state after a measurement, (2n,); see :class:`Estimator`."""
         q, h = self._positions(measurement), self._elapsed(measurement.t)
         copy_numbers(u, self._u, "inputs written last")
-        self._estimate(h, q, self._u, self._block, self._size, self._lead, self._known)
+        self._estimate(
+            h, q, self._u, self._block, self._size, self._room, self._known, self._delayed
+        )
         return self._state
 
     @property
     def jumps(self) -> int:
         """How often velocities have been knocked: what was planned is for another motion."""
         return int(self._odd[2])
+
+    @property
+    def delay(self) -> float:
+        """From a measurement to the moment when the answer to it acts, s, as far as is known."""
+        return self._lead * self.period + float(self._x[self._moved : self._learnt].sum())
 
     @property
     def learnt(self) -> ParameterEstimate | None:
@@ -521,5 +583,5 @@ class KalmanFilter(Estimator):
 
     @property
     def covariance(self) -> FloatArray:
-        """Covariance of the state (and of the disturbance) at the measurement."""
+        """Covariance of the state (disturbance, delay, parameters) at the measurement."""
         return self._P.copy()

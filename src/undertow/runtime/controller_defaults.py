@@ -31,6 +31,10 @@ SAMPLE, DOUBLED = 0.001, 3
 #: Density of the drift of a matched disturbance, parts of the smallest input limit per √s.
 DRIFT = 0.1
 
+#: Standard deviation of the delay as it is told, in periods of no more than ``SAMPLE``, s, each:
+#: drivers, buses and amplifiers add to what the data sheets of cards and encoders say.
+UNTOLD = 4.0
+
 #: Standard deviation of a position that is read as it is, rad or m.
 EXACT = 1e-6
 
@@ -46,7 +50,7 @@ def estimator_for(
 
     ``drift``: density of the matched disturbance's drift, input units per √s; ``DRIFT`` of the
     smallest limit by default, 0 estimates none. ``known``: what is not known of the model's
-    parameters, which are then learnt.
+    parameters, which are then learnt, as is what the delay is longer or shorter than it is told.
     """
     encoders = [bench.encoders.get(c.name, Encoder()) for c in belief.coordinates]
     full, timing = full_accelerations(belief), bench.timing
@@ -61,6 +65,7 @@ def estimator_for(
         time_noise=timing.jitter / math.sqrt(12),
         disturbance_drift=DRIFT * float(finite_limits(belief).min()) if drift is None else drift,
         delay=timing.input_delay + timing.measurement_delay,
+        delay_tolerance=0.0 if known is None else UNTOLD * min(SAMPLE, timing.period),
         belief=known,
     )
 
