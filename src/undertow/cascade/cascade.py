@@ -313,7 +313,8 @@ class Cascade:
         """Choose what takes over when velocities jump, by rollouts; return it with the memory.
 
         Candidates are the plan in use, then the first optimum from x, (2n,), and those of
-        :attr:`reserve`.  Who steers a plant that may be pushed asks for it once, before the run.
+        :attr:`reserve`, both reached ever more strongly.  Who steers a plant that may be pushed
+        asks for it once, before the run.
         """
         error = state.error(state.since, self.mechanism.check_state(x))
         known = state.estimate

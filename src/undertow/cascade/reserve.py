@@ -25,8 +25,7 @@ JUMPS = (0.25, 0.5, 1.0, 2.0, 4.0)
 
 
 def ever_stronger(plan: Plan, reaching: ReachingLaw) -> tuple[Plan, ...]:
-    """Return a plan with its reaching gains and layers ``STRONGER`` times, those of ``reaching``
-    where it has none of its own."""
+    """Return a plan with ``STRONGER`` times its reaching gains and layers, else ``reaching``'s."""
     m = plan.surfaces[0].m
     gains = [(law, *law.per_surface(m)) for law in plan.laws(reaching)]
     return tuple(
@@ -84,12 +83,11 @@ class Reserve:
         return self.plans[best - 1] if best else None
 
     def after_jump(self, loop: ClosedLoop, first: Plan, error: FloatArray) -> Plan:
-        """The plan to go on with when velocities have jumped: one of these, or the first optimum
-        as it is or reached more strongly.
+        """The plan to go on with when velocities have jumped: one of these, or the first optimum.
 
-        It is the one that brings home from most of the ``JUMPS`` at rest, and of those the cheapest
-        in sum.  The plan in use is none of them: at rest that was chosen for hardly any cost, and
-        what it does elsewhere nobody asked.
+        That, too, may be reached more strongly.  It is the one that brings home from most of the
+        ``JUMPS`` at rest, and of those the cheapest in sum.  The plan in use is none of them: at
+        rest that was chosen for hardly any cost, and what it does elsewhere nobody asked.
         """
         mechanism, n = loop.mechanism, loop.mechanism.n
         far = float(np.abs(error[:n]).max())

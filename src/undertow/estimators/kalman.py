@@ -536,8 +536,11 @@ class KalmanFilter(Estimator):
         return int(self._odd[2])
 
     @property
-    def delay(self) -> float:
-        """From a measurement to the moment when the answer to it acts, s, as far as is known."""
+    def estimated_delay(self) -> float:
+        """From a measurement to the moment when the answer to it acts, s, as far as is known.
+
+        Dry friction that the model leaves out moves it by a millisecond or two.
+        """
         return self._lead * self.period + float(self._x[self._moved : self._learnt].sum())
 
     @property
