@@ -421,15 +421,19 @@ def test_the_observed_disturbance_frees_an_arm_that_stiction_holds(arm: ut.Mecha
 
 
 @pytest.mark.slow
-def test_the_cascade_bears_a_knock_that_its_soft_surfaces_do_not() -> None:
-    """φ̇ jumps by 11 rad/s at 2 s: a decision a period later comes too late."""
+@pytest.mark.parametrize("impulse", [0.03, 0.034])
+def test_the_cascade_bears_a_knock_that_its_soft_surfaces_do_not(impulse: float) -> None:
+    """φ̇ jumps by 11 or 12.5 rad/s at 2 s: a decision a period later comes too late.
+
+    After the larger one the arm has farther to come back than 4 s suffice for.
+    """
     bench, x0 = srv02_rig(), srv02_rig().mechanism.state(phi=math.radians(20))
     belief = bench.mechanism
-    knocked = replace(bench, pushes=(Push(2.0, "phi", 0.03),))
+    knocked = replace(bench, pushes=(Push(2.0, "phi", impulse),))
     objective = objective_for(belief, "bench-energy")
     make = controllers(belief, bench, objective, x0)["cascade"]
     outcome = trial(belief, knocked, make, x0, 6.0, 0, objective=objective)
-    assert outcome.caught
+    assert outcome.caught or impulse > 0.03
     fallen = np.abs(outcome.record.truth[:, 1]).max()
     assert fallen < math.radians(60)
 
