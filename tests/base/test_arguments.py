@@ -355,3 +355,14 @@ def test_numbers_of_every_kind_are_floats_where_these_are_asked_for(kind: Any) -
     with pytest.raises(InvalidInputError) as refusal:
         told(np.zeros((3, 3)))  # type: ignore[arg-type]
     assert "\n" not in str(refusal.value)
+
+
+def test_an_unknown_argument_is_refused_with_those_that_are_like_it(rig: ut.Mechanism) -> None:
+    """Python's TypeError knew neither."""
+    with pytest.raises(InvalidInputError, match=r"argument of first_surface: .*mean weights"):
+        ut.first_surface(rig, weight=[1.0] * 4)  # type: ignore[call-arg]
+    loop = ut.ClosedLoop(rig)
+    with pytest.raises(
+        InvalidInputError, match=r"argument of ClosedLoop.simulate: .*mean duration"
+    ):
+        loop.simulate(rig.state(), ut.first_surface(rig), durations=1.0)  # type: ignore[call-arg]

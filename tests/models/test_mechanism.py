@@ -337,6 +337,34 @@ def test_states_are_set_by_name_and_functions_broadcast() -> None:
     assert rig.energy(x).shape == (3, 4)
 
 
+def test_a_start_that_seems_to_be_in_degrees_is_told_of_before_any_work() -> None:
+    """phi=20 was said to be 1146° after a search of 49,000 candidates."""
+    rig = ut.mechanisms.rotary_pendulum()
+    cascade = ut.Cascade(rig)
+    for start in ({"phi": 20.0}, {"x0": {"phi": -20.0}}):
+        with (
+            pytest.raises(InvalidInputError, match="duration"),
+            pytest.warns(UserWarning, match=r"rad is -?1146°.*undertow\.deg\(-?20\)") as told,
+        ):
+            cascade.simulate(**start, duration=-1.0)
+        assert [one.filename for one in told] == [__file__]
+    assert rig.initial_state(None, {"theta": 20.0, "phi": -2 * math.pi}).any()  # without a word
+
+
+def test_an_unknown_field_is_refused_with_those_that_there_are() -> None:
+    """Python told of a keyword argument that __init__ does not know."""
+    x, phi = ut.Coordinate("x", "m"), ut.Coordinate("phi", "rad")
+    energy = x.velocity**2 + phi.velocity**2
+    for wrong, words in (
+        ("B", "one of dissipation, input_matrix"),
+        ("start_", "Did you mean start"),
+    ):
+        with pytest.raises(InvalidInputError, match=f"from_energies: got '{wrong}'.*{words}"):
+            ut.Mechanism.from_energies(
+                "rig", [x, phi], [ut.Input("push", "N")], energy, phi.symbol**2, **{wrong: 1}
+            )
+
+
 # -- refusals --------------------------------------------------------------------------------
 
 y, z = ut.Coordinate("y", "m"), ut.Coordinate("z", "m")

@@ -119,13 +119,17 @@ Give a number in SI units: undertow.deg(10) for an angle of 10°
             if type(value) not in _PLAIN and parameter in floating:
                 given = (*given[:k], float(cast(float, value)), *given[k + 1 :])
         for name, value in kwargs.items():
+            if name not in words and others is None:
+                one_of(
+                    f"argument of {function.__qualname__}", name, sorted(words - {"self", "cls"})
+                )
             parameter = name if name in words else others
             test = tests.get(parameter)
             if test is not None and not test(value):
                 _refuse(function, parameter, value, name)
             if type(value) not in _PLAIN and parameter in floating:
                 kwargs[name] = float(cast(float, value))
-        return function(*given, **kwargs)  # of a missing or an unknown name Python itself tells
+        return function(*given, **kwargs)  # of a missing name Python itself tells
 
     return call
 

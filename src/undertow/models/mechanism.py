@@ -10,9 +10,10 @@ from __future__ import annotations
 import hashlib
 import math
 import re
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, Self, cast
 
@@ -41,6 +42,7 @@ from undertow.models.quantities import (
     Input,
     Parameter,
     StateLike,
+    in_degrees,
     number_of,
     numbers,
     with_value,
@@ -293,6 +295,10 @@ class Mechanism:
             When T is not a quadratic form in the velocities; for undeclared symbols; for kinks,
             where SymPy's derivatives are wrong; or as for the class.
         """
+        own = {"name", "coordinates", "inputs", "mass_matrix", "force", "potential"}
+        known = ["dissipation", *(f.name for f in fields(cls) if f.init and f.name not in own)]
+        for given in rest:
+            one_of(f"argument of {cls.__name__}.from_energies", given, known)
         T, V, D = energies(
             name, coordinates, inputs, rest.get("parameters", ()), kinetic, potential, dissipation
         )
@@ -643,9 +649,15 @@ class Mechanism:
         InvalidInputError
             For both a vector and names, for several states, and with neither where the mechanism
             has no usual start.
+
+        Warns
+        -----
+        UserWarning
+            Of a name that puts an unactuated angle more than a turn off the target: degrees,
+            probably.
         """
         if x0 is None:
-            return self.state(**names) if names else self.usual_start
+            return self._named(names) if names else self.usual_start
         if names:
             raise InvalidInputError(
                 "initial state",
@@ -654,7 +666,7 @@ class Mechanism:
                 remedy="Leave one of them out",
             )
         if isinstance(x0, Mapping):
-            return self.state(**x0)
+            return self._named(x0)
         x = self.check_state(x0)
         if x.ndim != 1:
             raise InvalidInputError(
@@ -663,6 +675,13 @@ class Mechanism:
                 limit=f"({2 * self.n},), one state",
                 remedy="A run has one start; ClosedLoop.batch takes many",
             )
+        return x
+
+    def _named(self, names: Mapping[str, float]) -> FloatArray:
+        """Return the initial state of these names; warn where one seems to be in degrees."""
+        x = self.state(**names)
+        if turned := in_degrees(self.coordinates, self.m, x):
+            warnings.warn(f"initial state: {turned}", stacklevel=6)  # who called the verb
         return x
 
     @checked
