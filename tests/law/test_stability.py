@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 import undertow as ut
 from undertow.base import InvalidInputError, ModelError, SingularSurfaceError, UnstableSurfaceError
+from undertow.export import EmbeddedController
 from undertow.law import (
     OVERSHOOTS,
     gains_at_target,
@@ -572,3 +573,18 @@ def test_a_boundary_layer_is_as_thick_as_disturbances_ask_for() -> None:
     assert ut.Cascade(rubbing, reaching=own).reaching is own
     with pytest.raises(InvalidInputError, match="period of the law"):
         usual_reaching(rubbing, period=0.0)
+
+
+def test_what_is_given_no_law_takes_the_usual_one() -> None:
+    """A loop, a certificate and the exported C began with a layer that friction makes too thin."""
+    rubbing = replace(ut.mechanisms.rotary_pendulum(), disturbance_bounds=(0.5, 0.0))
+    surface = ut.first_surface(rubbing)
+    usual = usual_reaching(rubbing, surface)
+    assert usual != ut.ReachingLaw()
+    assert ut.ClosedLoop(rubbing).reaching == usual
+    slow = ut.ClosedLoop(rubbing, step=0.005, zoh_steps=2)
+    assert slow.reaching == usual_reaching(rubbing, period=0.01)
+    assert ut.certify(rubbing, surface, seconds=0, x0=rubbing.state()).subjects[0].reaching == usual
+    for period in (0.001, 0.004):
+        law = EmbeddedController(rubbing, surface, period=period).reaching
+        assert law == usual_reaching(rubbing, surface, period=period)

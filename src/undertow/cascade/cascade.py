@@ -46,6 +46,7 @@ from undertow.closed_loop.gate import Admission, Gate, cost_gate
 from undertow.closed_loop.rollout import MOST_STEPS
 from undertow.estimators import Belief, Estimator, ParameterEstimate
 from undertow.law import (
+    SUITED,
     Control,
     Plan,
     ReachingLaw,
@@ -62,9 +63,6 @@ from undertow.optimiser import Budget, DecisionVariables, Optimiser, Planner, Pr
 
 #: Stands for the objective that is meant where nobody says, until the mechanism is known.
 _USUAL = cast(Objective, None)
-
-#: Stands for the reaching law that is meant where nobody says, until mechanism and step are known.
-_SUITED = cast(ReachingLaw, None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +152,7 @@ class Cascade:
 
     mechanism: Mechanism
     objective: Objective = _USUAL
-    reaching: ReachingLaw = _SUITED
+    reaching: ReachingLaw = SUITED
     period: float = 0.1
     first: Surface | None = None
     step: float = 0.002

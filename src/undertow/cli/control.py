@@ -210,7 +210,7 @@ def optimise(
     belief, x0, goal = parse_task(name, start, objective, horizon, setting, limit, box, hard_input)
     check_out(out)
     cold = None if evaluations is None else Budget(evaluations)
-    loop = ClosedLoop(belief, goal, usual_reaching(belief))
+    loop = ClosedLoop(belief, goal)
     optimiser = Optimiser(loop, cold=cold, seed=seed)
     with progress_bar() as progress:
         progress("searching for the best surface", 0.0)

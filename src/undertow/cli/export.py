@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import tempfile
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import typer
 from rich.text import Text
@@ -29,7 +29,7 @@ from undertow.closed_loop import ClosedLoop
 from undertow.export import EmbeddedController, KalmanStep, carriers, files
 from undertow.export.estimate import STEPS, EstimatorStep
 from undertow.export.host import Build
-from undertow.law import ReachingLaw, Surface, check_surface, first_surface
+from undertow.law import SUITED, ReachingLaw, Surface, check_surface, first_surface
 from undertow.mechanisms import LIBRARY
 from undertow.models import Mechanism
 from undertow.objective import Goal
@@ -76,8 +76,8 @@ def export_c(
     surface: options.SurfaceText = None,
     start: options.Start = None,
     objective: options.Goal = "energy",
-    eta: float = 20.0,
-    layer: float = 0.1,
+    eta: float | None = None,
+    layer: float | None = None,
     real: Literal["double", "float"] = "double",
     period: float = 0.001,
     velocity: Annotated[
@@ -123,9 +123,10 @@ def export_c(
     control : WORD
         designed, the default: the designed surface. one-time: optimised at the start.
     eta
-        Reaching gain.
+        Reaching gain. Default: 20.
     layer
-        Half-width of the boundary layer.
+        Half-width of the boundary layer. Default: 0.1; with neither this nor --eta as thick as
+        disturbance bounds ask for, such as dry friction of a model file.
     real
         Floating-point type of the C.
     period
@@ -154,7 +155,8 @@ def export_c(
     _check_request(name, out, every=every, wanted=wanted, carried=bool(platforms))
     one_of("objective", objective, get_args(Goal))
     check_out(out)
-    law = ReachingLaw(eta, layer)
+    given: dict[str, Any] = {k: v for k, v in (("eta", eta), ("layer", layer)) if v is not None}
+    law = ReachingLaw(**given) if given else SUITED
 
     def controller(belief: Mechanism) -> EmbeddedController:
         if surface is not None:

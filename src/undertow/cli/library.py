@@ -11,7 +11,6 @@ from undertow.cli import options
 from undertow.cli.parsing import mechanism_named, parse_task
 from undertow.cli.terminal import carry_out, check_out, command, progress_bar, show, terminal, write
 from undertow.closed_loop import ClosedLoop
-from undertow.law import usual_reaching
 from undertow.objective import USUAL
 from undertow.optimiser import Optimiser
 
@@ -162,7 +161,7 @@ def animate(
     belief, x0, goal = parse_task(name, start, objective, horizon, setting, limit, box, hard_input)
     check_film(longest=longest, speed=speed)
     check_out(out)
-    loop = ClosedLoop(belief, goal, usual_reaching(belief))
+    loop = ClosedLoop(belief, goal)
     with progress_bar() as progress:
         progress("searching for the best surface", 0.0)
         plan = Optimiser(loop, seed=seed).require(x0).plan

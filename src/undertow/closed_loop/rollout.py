@@ -42,6 +42,7 @@ from undertow.closed_loop.trajectory import Batch, Event, Trajectory, recorded
 from undertow.closed_loop.work_array import LANES
 from undertow.law import (
     OVERSHOOTS,
+    SUITED,
     LawLayout,
     Plan,
     ReachingLaw,
@@ -49,6 +50,7 @@ from undertow.law import (
     check_surface_shape,
     coupling,
     gains_at_target,
+    usual_reaching,
 )
 from undertow.models import FloatArray, Mechanism, has_linear_model, steps_in
 from undertow.objective import MinimumEnergy, Objective
@@ -116,7 +118,8 @@ class ClosedLoop:
         :meth:`undertow.Objective.on`.  Nothing is optimised here: by default the paper's control
         energy is counted.
     reaching
-        Reaching law; its gains can be overridden for each rollout.
+        Reaching law, by default :func:`undertow.law.usual_reaching`; its gains can be
+        overridden for each rollout.
     plant
         The truth.  The belief itself by default; must have the same coordinates and inputs.  Its
         motors may be weaker than the belief says; stronger ones are not asked for more.
@@ -166,7 +169,7 @@ class ClosedLoop:
 
     mechanism: Mechanism
     objective: Objective = MinimumEnergy()
-    reaching: ReachingLaw = ReachingLaw()
+    reaching: ReachingLaw = SUITED
     plant: Mechanism | None = None
     step: float = 0.002
     zoh_steps: int = 0
@@ -183,6 +186,12 @@ class ClosedLoop:
 
     def __post_init__(self) -> None:
         """Refuse steps that the boundary layer cannot bear and plants of another mechanism."""
+        if self.reaching is None:
+            check_fields(self, "mechanism", "step", "zoh_steps")
+            positive("rollout step, s", self.step)
+            object.__setattr__(
+                self, "reaching", usual_reaching(self.mechanism, period=self._period)
+            )
         check_fields(self)
         object.__setattr__(self, "objective", self.objective.on(self.mechanism))
         for name, remedy in (

@@ -20,7 +20,16 @@ from numpy.typing import ArrayLike
 from undertow.base import InvalidInputError, one_for_each, one_of, positive, require
 from undertow.export.estimate import DerivativeStep, EstimatorStep, KalmanStep
 from undertow.export.names import HEADERS, c_name
-from undertow.law import LawLayout, Plan, ReachingLaw, SlidingModeLaw, Surface, check_surface
+from undertow.law import (
+    SUITED,
+    LawLayout,
+    Plan,
+    ReachingLaw,
+    SlidingModeLaw,
+    Surface,
+    check_surface,
+    usual_reaching,
+)
 from undertow.models import FloatArray, Mechanism
 from undertow.symbolic import Real, literal
 
@@ -36,7 +45,8 @@ class EmbeddedController:
     surface
         The surface, or the plan of surfaces, that is built in.
     reaching
-        Reaching law where the plan has none of its own.
+        Reaching law where the plan has none of its own; by default
+        :func:`undertow.law.usual_reaching` on its first surface.
     period
         Sample period, s.
     differentiator
@@ -74,7 +84,7 @@ class EmbeddedController:
 
     mechanism: Mechanism
     surface: Surface | Plan
-    reaching: ReachingLaw = ReachingLaw()
+    reaching: ReachingLaw = SUITED
     period: float = 0.001
     differentiator: EstimatorStep = DerivativeStep()
     slew: float | tuple[float, ...] | None = None
@@ -126,6 +136,9 @@ class EmbeddedController:
             limits,
             "Name what the actuators can deliver: mechanism.with_input_limit",
         )
+        if self.reaching is None:
+            law = usual_reaching(self.mechanism, self.plan.surfaces[0], period=self.period)
+            object.__setattr__(self, "reaching", law)
         for law in self.laws:
             check_surface(self.mechanism, law.surface)
             layer = law.reaching.vector(self.mechanism.m)[self.mechanism.m :]

@@ -28,6 +28,7 @@ from undertow.law.sliding import (
 )
 from undertow.law.stability import (
     OVERSHOOTS,
+    SUITED,
     Margin,
     check_surface,
     first_surface,
@@ -43,6 +44,7 @@ from undertow.law.surface import LawLayout, ProvedSet, ReachingLaw, Surface, Swi
 __all__ = [
     "LAYOUT",
     "OVERSHOOTS",
+    "SUITED",
     "Control",
     "InnerLoop",
     "LawLayout",

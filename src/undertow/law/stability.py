@@ -15,6 +15,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -274,6 +275,10 @@ def first_surface(
         )
     positive("convergence rate, 1/s", rate, zero=True)
     return _quadratic(mechanism, diagonal, rate)
+
+
+#: Stands for :func:`usual_reaching` where nobody gives a law, until mechanism and step are known.
+SUITED = cast(ReachingLaw, None)
 
 
 @checked

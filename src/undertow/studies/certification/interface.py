@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from undertow.base import Progress, checked, no_progress, positive, versions
-from undertow.law import ReachingLaw, Surface
+from undertow.law import ReachingLaw, Surface, usual_reaching
 from undertow.models import Mechanism, StateLike
 from undertow.proofs import Certificate, read_certificate
 from undertow.proofs.claims.verify import Checked
@@ -23,7 +23,7 @@ def certify(
     surface: Surface,
     x0: StateLike | None = None,
     *,
-    reaching: ReachingLaw = ReachingLaw(),
+    reaching: ReachingLaw | None = None,
     seconds: float = 60.0,
     loop: bool = False,
     loop_seconds: float = LOOP_SECONDS,
@@ -39,7 +39,7 @@ def certify(
     mechanism
         Belief and plant.
     surface, reaching
-        The law.
+        The law; where ``reaching`` is left out, :func:`undertow.law.usual_reaching` on the surface.
     x0
         A state, (2n,), or its non-zero entries by name (``phi=0.7``): its positions, with both
         signs, span the region in which the law must exist, and say which way the region of
@@ -84,7 +84,7 @@ def certify(
         mechanism,
         surface,
         start,
-        reaching_law=reaching,
+        reaching_law=usual_reaching(mechanism, surface) if reaching is None else reaching,
         seconds=seconds,
         loop=loop,
         loop_seconds=loop_seconds,
