@@ -427,7 +427,25 @@ def test_a_model_file_with_dry_friction_gets_the_layer_that_it_asks_for(
     (tmp_path / "arm.urdf").write_text(ARM)
     code, out, err = run("simulate", f"{tmp_path}/arm.urdf:shoulder", "--control", control)
     assert (code, "error" in err) == (0, False)
-    assert "boundary layer 0.2, 2 times as thick as usual" in " ".join(out.split())
+    said = " ".join(out.split())
+    assert "boundary layer 0.2, 2 times as thick as usual" in said
+    assert "simulated without disturbances" in said
+    assert "shoulder, 10%" in said
+
+
+def test_the_exported_c_begins_with_the_layer_that_friction_asks_for(tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text(ARM.replace("0.06", "0.2"))
+    for words, wanted in (((), 0), (("--layer", "0.1"), 2)):
+        out = str(tmp_path / "firmware")
+        model = f"{tmp_path}/arm.urdf:shoulder"
+        code, _, _ = run("export", "c", model, "--period", "0.002", "--out", out, *words)
+        assert code == wanted
+
+
+def test_a_verb_of_python_that_is_no_command_is_told_of() -> None:
+    code, _, err = run("compare")
+    assert code == 2
+    assert "In Python: undertow.compare" in " ".join(err.split())
 
 
 def test_what_is_proved_before_an_interruption_is_kept(

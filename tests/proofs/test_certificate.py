@@ -6,6 +6,7 @@ import ast
 import importlib.util
 import io
 import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
@@ -39,6 +40,7 @@ from undertow.proofs.claims.region import RegionClaim, reaches, verify_region
 from undertow.proofs.claims.stability import hurwitz
 from undertow.proofs.claims.terminal_ellipsoid import TerminalEllipsoid
 from undertow.proofs.claims.verify import check_settings, match, proved_sets, verify
+from undertow.proofs.claims.words import limits_words
 from undertow.proofs.claims.written import number_text
 from undertow.proofs.gate import GatePolicy, assess
 from undertow.proofs.kernel import claims as kernel
@@ -632,3 +634,9 @@ def test_other_mechanisms_get_certificates(name: str) -> None:
     checked = verify(Certificate.from_bytes(content), ut.mechanisms.LIBRARY[name]())
     assert {"stability", "terminal ellipsoid"} <= {item.claim.kind for item in checked}
     assert all(item.verdict for item in checked)
+
+
+def test_an_input_without_a_limit_is_said_to_have_none() -> None:
+    """It read |voltage| ≤ inf V."""
+    assert limits_words(model_of(RIG.with_input_limit(math.inf))) == "no limit on voltage"
+    assert limits_words(model_of(RIG.with_input_limit(2.5))) == "|voltage| ≤ 2.5 V"

@@ -533,3 +533,11 @@ def test_a_lead_time_grows_with_late_answers_and_shrinks_with_early_ones(lates: 
         assert abs(lead.seconds / 0.002 - round(lead.seconds / 0.002)) < 1e-9
         bound = 0.5 if late else 0.02
         assert (lead.seconds > before) == late or lead.seconds in (before, pytest.approx(bound))
+
+
+def test_a_run_of_no_length_is_refused_with_what_to_do() -> None:
+    cascade = ut.Cascade(ut.mechanisms.rotary_pendulum())
+    with pytest.raises(
+        InvalidInputError, match=r"length of a run, s: got -1.*Leave it out for 20 s"
+    ):
+        ut.run(cascade, seconds=-1.0)

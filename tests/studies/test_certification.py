@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -236,3 +237,33 @@ def test_the_picture_of_a_loop_shows_what_is_proved_and_what_falls(
     assert np.abs(motions[-1].get_ydata()).max() > 90
     assert "|force| ≤ 20 N" in drawn.get_suptitle()
     assert "renewed at every instant" in drawn.get_suptitle()
+
+
+def test_without_searches_half_of_the_work_is_done_before_the_samples() -> None:
+    """It was taken for a tenth, and minutes were said to be left where seconds were."""
+    parts: dict[str, float] = {}
+    ut.certify(
+        RIG, GOOD, phi=0.2, seconds=0, progress=lambda what, part: parts.update({what: part})
+    )
+    assert parts["prediction"] >= 0.5 > parts["disturbances"]
+    assert list(parts.values()) == sorted(parts.values())
+
+
+def test_a_run_is_certified_with_the_law_that_it_had(run: ut.Run) -> None:
+    law = ut.ReachingLaw(layer=0.2)
+    assert {one.subject.reaching for one in certify_run(RIG, run, reaching_law=law)} == {law}
+
+
+def test_friction_that_a_motion_leaves_out_is_told_of(run: ut.Run) -> None:
+    """Only the line of what was left out of a file had it."""
+    start, told = RIG.state(phi=0.2), "simulated without disturbances"
+    most = RIG.B[0, 0] * RIG.input_limits[0]
+    for part, words in ((0.0, ""), (0.09, ""), (0.25, "theta, 25%")):
+        rubbing = RIG.with_disturbance_bounds(part * most, 0.0)
+        shown = motion.motion_report(rubbing, GOAL, start, run.trajectory, run.surfaces[0], run)
+        flat = " ".join(text(shown).split())
+        assert (told in flat) == bool(words)
+        assert words in flat
+    free = RIG.with_disturbance_bounds(1.0, 0.0).with_input_limit(math.inf)
+    shown = motion.motion_report(free, GOAL, start, run.trajectory, run.surfaces[0], run)
+    assert told not in text(shown)

@@ -156,7 +156,9 @@ def certify(
             _, begin, goal = task
             cascade = Cascade(mechanism, goal, gate=certified_gate(), seed=seed, belief="exact")
             motion = cascade.simulate(begin, progress=lambda t, end: progress("cascade", t / end))
-            for one in certification.certify_run(mechanism, motion, kept=keep, progress=progress):
+            for one in certification.certify_run(
+                mechanism, motion, reaching_law=cascade.reaching, kept=keep, progress=progress
+            ):
                 keep(one)
             reports.append(certification.run_report(motion))
         elif x0 is None or used is None:

@@ -21,6 +21,7 @@ from rich.measure import Measurement
 from rich.text import Text
 from typer.core import TyperCommand, TyperGroup
 
+import undertow
 from undertow.base import (
     INTERRUPTED,
     ArtefactError,
@@ -82,7 +83,9 @@ class _Group(_Plain, TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Name the commands that are like a wrong one."""
         if args and args[0] not in self.commands and not args[0].startswith("-"):
-            like = near(args[0], self.commands) or f"There are {', '.join(self.commands)}"
+            python = f"In Python: undertow.{args[0]}" if args[0] in undertow.__all__ else ""
+            every = f"There are {', '.join(self.commands)}"
+            like = near(args[0], self.commands) or python or every
             ctx.fail(f"No such command '{args[0]}'. {like}")
         return super().resolve_command(ctx, args)
 

@@ -273,7 +273,7 @@ def run(
     """
     mechanism, settings = cascade.mechanism, settings or Settings()
     with closed_on_failure(rig) as kept:
-        positive("length of a run, s", seconds)
+        positive("length of a run, s", seconds, "Leave it out for 20 s")
         if rig is not None:
             check_rig(rig, mechanism)
         recipe = Recipe(

@@ -18,6 +18,9 @@ from undertow.models import FloatArray, Mechanism
 from undertow.objective import Objective
 from undertow.optimiser import Proposal
 
+#: Part of an input's limit from which on a disturbance that is left out is worth a sentence.
+NOTABLE = 0.1
+
 _ENDINGS = {
     Event.REACHED: "reached the target, {off} ≤ {radius:g}",
     Event.HORIZON: "had not reached {off} ≤ {radius:g} by the horizon: {off} = {norm:.3g}",
@@ -129,9 +132,25 @@ def motion_report(
     ]
     good = motion.event == Event.REACHED
     said = ended(motion, objective, target)
-    if good and motion.time == motion.t[0]:
-        return Group(facts(rows), Text(said))
-    return Group(facts(rows), mark(good) + Text(f" {said}"))
+    end = Text(said) if good and motion.time == motion.t[0] else mark(good) + Text(f" {said}")
+    return Group(facts(rows), end, *map(Text, _undisturbed(mechanism)))
+
+
+def _undisturbed(mechanism: Mechanism) -> list[str]:
+    """Say of disturbance bounds that are a good part of an input what the motion leaves out."""
+    large = []
+    for c, bound, row in zip(
+        mechanism.coordinates, mechanism.disturbance_bounds, np.abs(mechanism.B), strict=False
+    ):
+        force = sum(b * most for b, most in zip(row, mechanism.input_limits, strict=True) if b)
+        if bound >= NOTABLE * force:
+            large.append(f"{c.name}, {bound / force:.0%}")
+    if not large:
+        return []
+    return [
+        "The plant was simulated without disturbances: dry friction, or what else the mechanism's "
+        f"disturbance bounds are for, may take this part of the input's limit: {'; '.join(large)}."
+    ]
 
 
 def _descent(run: Run, objective: Objective, *, learns: bool) -> tuple[str, str]:

@@ -36,7 +36,9 @@ def region_words(positions: Sequence[Quantity], box: Region) -> str:
 def limits_words(model: Model) -> str:
     """Return the input limits in words, each as it is."""
     parts = [
-        f"|{i.name}| ≤ {'inf' if i.value is None else exactly(i.value)} {i.unit}".rstrip()
+        f"no limit on {i.name}"
+        if i.value is None
+        else f"|{i.name}| ≤ {exactly(i.value)} {i.unit}".rstrip()
         for i in model.inputs
     ]
     return ", ".join(parts)

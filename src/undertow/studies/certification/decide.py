@@ -59,7 +59,7 @@ LOOP_SECONDS = 300.0
 #: Part of what one disturbance alone may be that is claimed: rounding away from the edge.
 CLAIMED = 0.999
 
-#: About how long what comes first takes, and what is sampled at last, s.
+#: About how long what comes first takes once it is compiled, and what is sampled at last, s.
 FIRST, LAST = 0.6, 5.0
 
 
@@ -117,7 +117,8 @@ def certify_surface(
     that is known by then: what an interruption leaves.
     """
     began = time.perf_counter()
-    most = FIRST + seconds + (2 * loop_seconds if loop else 0.0) + (LAST if predict else 0.0)
+    first = FIRST if seconds or loop else LAST  # beside a search what comes first is little
+    most = first + seconds + (2 * loop_seconds if loop else 0.0) + (LAST if predict else 0.0)
 
     def tell(what: str, after: float) -> None:
         """Say what comes after so many of the seconds that all may take."""
@@ -138,23 +139,23 @@ def certify_surface(
 
     keep(*decide.own(StabilityClaim()))
     if decide.claims:
-        tell("terminal set", 0.3 * FIRST)
+        tell("terminal set", 0.3 * first)
         keep(*decide.ellipsoid())
-        tell("non-singularity", 0.5 * FIRST)
+        tell("non-singularity", 0.5 * first)
         if decide.box:
             keep(*decide.nonsingular())
-        tell("disturbances", 0.8 * FIRST)
+        tell("disturbances", 0.8 * first)
         for claim, verdict in decide.disturbances():
             keep(claim, verdict)
         if seconds > 0:
-            tell(f"region on the surface, a search of {seconds:g} s and a proof", FIRST)
+            tell(f"region on the surface, a search of {seconds:g} s and a proof", first)
             region, found, verdict = decide.region(seconds)
             keep(found, verdict)
             if region is not None and uncertain:
                 keep(*decide.region_in_box(region))
         if loop:
             searched = f"a search of {loop_seconds:g} s and a proof of about as long"
-            tell(f"the whole closed loop, {searched}", FIRST + seconds)
+            tell(f"the whole closed loop, {searched}", first + seconds)
             keep(*decide.loop(hold, loop_seconds))
         if predict and start.any():
             tell("prediction", most - LAST)
@@ -328,12 +329,17 @@ def _sampled(loop: ClosedLoop, surface: Surface, start: FloatArray) -> list[Verd
 
 
 def certify_run(
-    mechanism: Mechanism, run: Run, *, kept: Kept = no_keeping, progress: Progress = no_progress
+    mechanism: Mechanism,
+    run: Run,
+    *,
+    reaching_law: ReachingLaw = ReachingLaw(),
+    kept: Kept = no_keeping,
+    progress: Progress = no_progress,
 ) -> tuple[Certified, ...]:
     """Decide stability and a terminal set for every surface that a run applied, in order.
 
-    The admissions' verdicts become remarks of the surface that they admitted; ``kept`` is as for
-    :func:`certify_surface`.
+    ``reaching_law`` is that of the cascade that ran. The admissions' verdicts become remarks of the
+    surface that they admitted; ``kept`` is as for :func:`certify_surface`.
     """
     seen: dict[Surface, list[Verdict]] = {}
     for update in run.updates:
@@ -344,7 +350,7 @@ def certify_run(
     for surface in each(seen, progress, lambda _: "surfaces of the run"):
         base = certify_surface(
             mechanism, surface, np.zeros(2 * mechanism.n), title=f"surface {len(certified) + 1}",
-            seconds=0.0, predict=False, kept=kept,
+            reaching_law=reaching_law, seconds=0.0, predict=False, kept=kept,
         )  # fmt: skip
         remarks = (*base.subject.remarks, *(v for v in seen[surface] if not v))
         certified.append(replace(base, subject=replace(base.subject, remarks=remarks)))
