@@ -712,7 +712,8 @@ def test_task_beyond_the_actuator_is_infeasible() -> None:
 
 
 def test_degrees_that_are_taken_for_radians_are_pointed_out() -> None:
-    with pytest.raises(InfeasibleError, match=r"40 rad is 2292°.*undertow\.deg\(40\)"):
+    words = r"40 rad is 2292°.*undertow\.deg\(40\)"
+    with pytest.raises(InfeasibleError, match=words), pytest.warns(UserWarning, match=words):
         bound(pendulum(), ut.MinimumTime(), horizon=0.5, intervals=10, phi=40.0)
 
 
