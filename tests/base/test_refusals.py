@@ -48,10 +48,10 @@ def test_the_step_must_follow_the_gains_of_the_disturbance_bounds(rig: ut.Mechan
     surface = ut.first_surface(bounded)
     x0 = bounded.state(theta=0.08 / surface.lambda_a.item())
     with pytest.raises(InvalidInputError, match=r"gains \(13\)") as refusal:
-        ut.ClosedLoop(bounded).simulate(x0, surface)
+        ut.ClosedLoop(bounded, reaching=ut.ReachingLaw()).simulate(x0, surface)
     limit = float(str(refusal.value.limit).split("=")[1].split()[0])
     assert limit < 2 * 0.1 / 20  # what η alone would ask for
-    loop = interpreted(ut.ClosedLoop(bounded, step=limit / 2))
+    loop = interpreted(ut.ClosedLoop(bounded, reaching=ut.ReachingLaw(), step=limit / 2))
     s = loop.simulate(x0, surface, duration=10 * limit).s[:-1, 0]
     assert s[0] == pytest.approx(0.08)
     assert (np.diff(s) < 0).all()
