@@ -20,7 +20,8 @@ STRONGER = (1.0, 2.0, 4.0, 8.0)
 ROOM = 0.8
 
 #: Impulses after which plans are compared, on each coordinate and either way: parts of what would
-#: carry it, at the rate of the fastest mode, as far as the start is.  No plan bears the largest.
+#: carry it, at the rate of the fastest mode, as far as the start is.  Few plans bear the
+#: larger ones, which tell apart what bears much.
 JUMPS = (0.25, 0.5, 1.0, 2.0, 4.0)
 
 

@@ -10,9 +10,9 @@ belief says that they are uncertain, parameters: the filter moves with what it h
 A knock changes velocities at once, which no parameter explains.  A reading that is off by more than
 the filter's own statistics allow is left out, if it is the only one in a row: it was bad.  The next
 one means that the velocities have jumped: their covariance takes in as large a jump as the readings
-show, and parameters are not learnt for a while (a test of the innovations, and a reset of the
-covariance; Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation*,
-2001, 11.6).
+show, and neither parameters nor a delay are learnt for a while (a test of the innovations, and a
+reset of the covariance; Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and
+Navigation*, 2001, 11.6).
 
 A delay τ that is not known for sure is estimated, too: inputs change all the time, and how soon the
 motion shows it tells when they act (∂q̈/∂τ = −∂q̈/∂u u̇).  Dry friction turns over with its joint,
@@ -67,7 +67,8 @@ AVERAGED = 1.0
 #: are, two.
 JUMP = 6.0
 
-#: Time after a jump in which no parameters are learnt, s: the velocities have to be found first.
+#: Time after a jump in which neither parameters nor the delay are learnt, s: the velocities have to
+#: be found first.
 SETTLES = 0.02
 
 #: A jump of a velocity is a knock, after which what was planned is for another motion, if the full
