@@ -488,8 +488,16 @@ def test_a_prediction_that_fails_costs_no_proof(monkeypatch: pytest.MonkeyPatch)
     assert "step for the gains: got 0.002 s" in " ".join(out.split())
 
 
-def test_a_polite_kill_shows_what_is_finished(capfd: pytest.CaptureFixture[str]) -> None:
-    """SIGTERM, with which batch systems end what takes too long, lost every finished row."""
+@pytest.mark.parametrize("heard", [True, False])
+def test_a_polite_kill_shows_what_is_finished(
+    capfd: pytest.CaptureFixture[str], heard: bool
+) -> None:
+    """SIGTERM, with which batch systems end what takes too long, lost every finished row.
+
+    A job in the background does not hear Ctrl-C: shells start it so.
+    """
+    usual = signal.default_int_handler if heard else signal.SIG_IGN
+    before = signal.signal(signal.SIGINT, usual)
 
     def killed() -> float:
         os.kill(os.getpid(), signal.SIGTERM)
@@ -500,8 +508,11 @@ def test_a_polite_kill_shows_what_is_finished(capfd: pytest.CaptureFixture[str])
     work: Experiment[float, Any] = Experiment(
         "numbers", tuple[str, float], tasks, {}, lambda found: [f"finished: {found}"]
     )
-    with pytest.raises(typer.Exit) as ending:
-        carry_out(work, None)
+    try:
+        with pytest.raises(typer.Exit) as ending:
+            carry_out(work, None)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert ending.value.exit_code == 130
     out, err = capfd.readouterr()
     assert "finished: (1.0,)" in out

@@ -53,17 +53,30 @@ def by_exception() -> None:
 def ended_as_interrupted() -> Iterator[None]:
     """Let SIGTERM, with which systems end what has run too long, end what is done in it as Ctrl-C.
 
-    Where somebody else handles it, and in other threads than the main one, nothing changes.
+    So it does where Ctrl-C itself is ignored, as shells have it for jobs in the background.  Where
+    somebody else handles SIGTERM, and in other threads than the main one, nothing changes.
     """
     mine = signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     if not mine or threading.current_thread() is not threading.main_thread():
         yield
         return
-    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    signal.signal(signal.SIGTERM, _end)
     try:
         yield
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    asked = signal.getsignal(signal.SIGINT)
+    if not callable(asked):
+        raise KeyboardInterrupt
+    asked(number, frame)
+
+
+def _once_more() -> None:
+    heard = callable(signal.getsignal(signal.SIGINT))
+    signal.raise_signal(signal.SIGINT if heard else signal.SIGTERM)
 
 
 @contextmanager
@@ -82,7 +95,7 @@ def interruptible() -> Iterator[None]:
         if met.exc_type is not KeyboardInterrupt:
             before(met)
         elif not (again and again[-1].is_alive()):
-            again.append(threading.Timer(AGAIN, signal.raise_signal, [signal.SIGINT]))
+            again.append(threading.Timer(AGAIN, _once_more))
             again[-1].daemon = True
             again[-1].start()
 
