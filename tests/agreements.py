@@ -84,23 +84,9 @@ def estimator(subject: Subject) -> Iterator[Difference]:
             "estimator: prediction", x, after, _moved(subject, x, u, None), names
         )
         module.jacobian(
-            STEP,
-            x.copy(),
-            u,
-            np.zeros(m),
-            n,
-            m,
-            False,
-            parameters,
-            none,
-            none,
-            F,
-            A,
-            qdd,
-            base,
-            viscous,
-            driven,
-        )
+            STEP, x.copy(), u, np.zeros(m), n, m, False, parameters, none, none, F, A, qdd, base,
+            viscous, driven,
+        )  # fmt: skip
         here = subject.model.accelerations(0.0, exactly(x), exactly(u))
         slopes = [[Number(int(j == n + i)) for j in range(2 * n)] for i in range(n)]
         columns = []

@@ -133,15 +133,9 @@ def simulate(
         known = known or ("exact" if accept or schedule else "usual")
         freedom = DecisionVariables(reaching=schedule > 0, schedule=schedule)
         loop = cascade = Cascade(
-            belief,
-            goal,
-            period=period,
-            gate=gate,
-            seed=seed,
-            belief=known,
-            freedom=freedom,
+            belief, goal, period=period, gate=gate, seed=seed, belief=known, freedom=freedom,
             cold=cold,
-        )
+        )  # fmt: skip
         with progress_bar() as progress:
             run = cascade.simulate(
                 x0,
