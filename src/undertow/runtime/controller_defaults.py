@@ -14,7 +14,7 @@ import numpy as np
 from undertow.cascade import Cascade, Gate, cost_gate, noise_share, robustness_gate
 from undertow.cascade.robustness import delay_margin
 from undertow.estimators import Belief, Estimator, KalmanFilter
-from undertow.law import ReachingLaw, first_surface, usual_reaching
+from undertow.law import SUITED, ReachingLaw, first_surface, usual_reaching
 from undertow.models import Mechanism, full_accelerations
 from undertow.objective import finite_limits
 from undertow.plants import Bench, Encoder
@@ -107,7 +107,7 @@ def for_rig(cascade: Cascade, estimator: Estimator) -> Cascade:
     gate, reaching, covariance = cascade.gate, cascade.reaching, cascade.covariance
     if gate is cost_gate:
         gate = default_gate(estimator)
-    if reaching in (ReachingLaw(), usual_reaching(cascade.mechanism, period=cascade.step)):
+    if reaching in (ReachingLaw(), replace(cascade, reaching=SUITED).reaching):
         reaching = reaching_for(estimator)
     if covariance is None:
         covariance = estimator.noise_covariance()
