@@ -239,6 +239,7 @@ class Task:
         """Repeat a routine until the rollouts are spent; yield the best plan."""
         rng, left = np.random.default_rng(seed), self._budget(LONGER).evaluations
         best, best_z = math.inf, self.optimiser.firsts[0]
+        horizon = self.loop.objective.horizon
 
         def cost(z: FloatArray) -> FloatArray:
             nonlocal best, best_z, left
@@ -246,8 +247,8 @@ class Task:
                 raise _SpentError
             left -= len(z)
             z = np.asarray(z, dtype=float)
-            batch = self.space.batch(self.x0, z, stable_only=True)
-            f = np.asarray(batch.score(self.loop.objective.horizon))
+            batch = self.space.batch(self.x0, z, duration=horizon, stable_only=True)
+            f = np.asarray(batch.score(horizon))
             if f.min() < best:
                 best, best_z = float(f.min()), np.array(z[int(f.argmin())], dtype=float)
             return f
