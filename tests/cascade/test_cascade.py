@@ -354,7 +354,7 @@ def test_unusable_settings_are_refused(rig: ut.Mechanism) -> None:
 # -- how far down the kernel is ----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("objective", [ut.MinimumEnergy(), ut.MinimumTime()])
+@pytest.mark.parametrize("objective", [ut.MinimumEnergy(horizon=2.0), ut.MinimumTime()])
 def test_ten_frames_lie_between_simulate_and_the_kernel(
     objective: ut.Objective, rig: ut.Mechanism, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -42,7 +42,7 @@ def changed(pendulum: ut.Mechanism, parts: Mapping[str, float]) -> ut.Mechanism:
 def test_a_cascade_learns_the_plant(pendulum: ut.Mechanism) -> None:
     """After 0.1 s law and predictions are those of a plant that is heavier, its motor weaker."""
     plant = changed(pendulum, {"m": 0.15, "I_e": 0.15, "a_e": -0.08})
-    cascade = learning(pendulum, ut.MinimumTime(horizon=6.0))
+    cascade = replace(learning(pendulum, ut.MinimumTime(horizon=6.0)), cold=ut.Budget(1024))
     x = pendulum.state(phi=0.5)
     memory, _ = cascade.start(x)
     assert memory.estimate is not None
@@ -170,9 +170,8 @@ def test_where_no_plan_suits_all_the_one_that_lives_longest_is_kept(
     assert not cost_gate(cascade.loop, long, short, x, 6.0).accepted
     alone = replace(cascade, belief="exact").loop
     assert not cost_gate(alone, short, long, x, 6.0).accepted
-    state = CascadeState(
-        short, x=tuple(x), estimate=cascade.start(pendulum.state(phi=0.1))[0].estimate
-    )
+    assert cascade.known is not None
+    state = CascadeState(short, x=tuple(x), estimate=cascade.known.prior)
     proposal = cascade.propose(state, x)
     assert proposal.status == "infeasible"
     assert proposal.plan is not None

@@ -17,6 +17,8 @@ from undertow.closed_loop.along_reference import simulate_along
 from undertow.models import FloatArray
 
 CRANE = ut.mechanisms.overhead_crane()
+#: Without its travel: about a target it has the formulas that it has about zero.
+FREE = replace(CRANE, coordinates=(ut.Coordinate("x", "m"), CRANE.coordinates[1]))
 JUMPS = ut.SetPoints([(0, {"x": 1.0}), (2, {"x": -1.0}), (4, {"x": 0.5})])
 
 
@@ -87,8 +89,8 @@ def test_a_jump_begins_a_new_task_for_lemma_3(run: ut.Run) -> None:
 
 def test_to_come_back_there_is_a_whole_horizon(cascade: ut.Cascade) -> None:
     """A load that swings in and out of the terminal set: each time it left, a task afresh."""
-    goal = replace(cascade.objective, terminal_radius=0.3, horizon=3.0)
-    swinging = replace(cascade, objective=goal, cold=ut.Budget(512), period=0.5)
+    goal = replace(ut.objective_for(FREE, "bench-energy", horizon=3.0), terminal_radius=0.3)
+    swinging = replace(cascade, mechanism=FREE, objective=goal, cold=ut.Budget(512), period=0.5)
     watch = Watch(swinging.optimiser)
     swinging = replace(swinging, planner=watch)
     run = swinging.simulate(CRANE.state(theta_dot=1.0), target={"x": 0.0}, duration=5.0)
@@ -217,7 +219,7 @@ def test_a_refusal_tells_what_the_plan_in_use_costs_along_the_reference(
 ) -> None:
     """Not what the gate says of it about the target at rest."""
     cascade = ut.Cascade(
-        rig, ut.objective_for(rig, "bench-energy"), belief="exact",
+        rig, ut.objective_for(rig, "effort"), belief="exact",
         gate=lambda *_: Admission(False, "no", 1.0),
     )  # fmt: skip
     target = ut.Reference.sine(0.5, theta=0.3).legs(rig, 4.0)[0][1]
@@ -260,7 +262,7 @@ def test_what_is_predicted_in_one_go_is_predicted_in_two(
     rig: ut.Mechanism, quick: ut.Surface, target: ut.Reference | None
 ) -> None:
     """Flows compose, whenever they begin; beside a target that moves, too."""
-    cascade = ut.Cascade(rig, ut.objective_for(rig, "bench-energy"), belief="exact")
+    cascade = ut.Cascade(rig, ut.objective_for(rig, "effort"), belief="exact")
     motion = None if target is None else target.legs(rig, 4.0)[0][1]
     state, error = CascadeState(ut.Plan.of(quick), target=motion), rig.state(phi=0.2)
     halfway = cascade.predicted_error(state, error, 1.0, 1.2)
@@ -271,9 +273,7 @@ def test_what_is_predicted_in_one_go_is_predicted_in_two(
 
 def test_what_was_reached_comes_to_rest() -> None:
     """What arrives for least energy hardly damps: once home another surface holds it."""
-    cascade = ut.Cascade(
-        CRANE, ut.objective_for(CRANE, "bench-energy", horizon=4.0), belief="exact"
-    )
+    cascade = ut.Cascade(FREE, ut.objective_for(FREE, "bench-energy", horizon=4.0), belief="exact")
     run = cascade.simulate(CRANE.state(x=0.2), target={"x": 0.0}, duration=9.0)
     assert run.reached
     assert np.linalg.norm(run.trajectory.x[-1]) < 0.1 * cascade.objective.terminal_radius

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -819,6 +820,8 @@ def test_a_motion_goes_on_where_learnt_parameters_raise_the_gains_beyond_the_ste
     loop = ut.ClosedLoop(believed, step=0.999 * 2 * 0.1 / gains)
     learnt = loop.believing(believed.with_parameters(m=0.1))
     assert learnt._fastest(RolloutBuffers(learnt, 1, 1).fill(x0, quick.vector).lanes)[0] > 2
+    kernel = learnt._kernels.rollout.py_func  # what no plan is chosen by is not worth compiling
+    vars(learnt)["_kernels"] = SimpleNamespace(rollout=kernel)
     assert learnt.batch(x0, quick).event[0] == Event.UNSTABLE  # no plan to be chosen
     motion = learnt.simulate(x0, quick, duration=5 * loop.step)
     assert motion.event == Event.HORIZON
@@ -941,10 +944,12 @@ def test_along_a_reference_a_controller_keeps_to_its_belief_s_limit(
 def test_a_plant_that_is_another_mechanism_is_refused(rig: ut.Mechanism, other: str) -> None:
     """Two coordinates and one input, too: a law for the one does nothing sensible to the other."""
     plant = getattr(ut.mechanisms, other)()
+    there = IdealRig(rig)
+    there.mechanism = plant  # as a rig of that mechanism says it, and nothing is compiled for it
     for made in (
         lambda: ut.ClosedLoop(rig, plant=plant),
         lambda: ut.compare(rig, [ut.lqr(rig)], plants=[plant], phi=0.1),
-        lambda: ut.run(ut.Cascade(rig), IdealRig(plant), phi=0.1, simulated=True),
+        lambda: ut.run(ut.Cascade(rig), there, phi=0.1, simulated=True),
     ):
         with pytest.raises(InvalidInputError, match=r"must be theta .rad., phi .rad., voltage"):
             made()

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -178,14 +178,15 @@ def test_with_nothing_uncertain_the_cascade_is_the_exact_one_bit_for_bit(
     """Tolerances of 0, or a belief without any: neither ensemble nor margins, nothing learnt."""
     usual = ut.mechanisms.LIBRARY[name]()
     rig = replace(usual, parameters=tuple(replace(p, tolerance=0.0) for p in usual.parameters))
+    few: dict[str, Any] = {"cold": ut.Budget(1024), "warm": ut.Budget(64)}
     x = rig.state(**start)
-    exact = ut.Cascade(rig, aim, belief="exact").simulate(x)
+    exact = ut.Cascade(rig, aim, belief="exact", **few).simulate(x)
     for belief in (Belief.usual(rig), Belief(rig, {})):
-        run = ut.Cascade(rig, aim, belief=belief).simulate(x)
+        run = ut.Cascade(rig, aim, belief=belief, **few).simulate(x)
         assert np.array_equal(run.trajectory.x, exact.trajectory.x)
         assert np.array_equal(run.trajectory.accumulated_cost, exact.trajectory.accumulated_cost)
         assert [u.predicted for u in run.updates] == [u.predicted for u in exact.updates]
-    run = ut.Cascade(rig, aim).simulate(x)
+    run = ut.Cascade(rig, aim, **few).simulate(x)
     assert np.array_equal(run.trajectory.x, exact.trajectory.x)
 
 

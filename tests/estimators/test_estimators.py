@@ -26,7 +26,16 @@ from undertow.estimators import (
 )
 from undertow.estimators.recorded_run import Record, subtract_disturbance
 from undertow.law import InnerLoop
-from undertow.plants import Bench, IdealRig, Measurement, RealisticRig, Timing, srv02_rig
+from undertow.models import FloatArray
+from undertow.plants import (
+    Bench,
+    IdealRig,
+    Measurement,
+    RealisticRig,
+    RigWrapper,
+    Timing,
+    srv02_rig,
+)
 from undertow.runtime import Recipe
 
 PERIOD = 1e-3
@@ -150,9 +159,13 @@ def test_the_covariance_of_the_kalman_filter_is_honest(arm: ut.Mechanism) -> Non
 
 
 def test_a_matched_disturbance_is_found(arm: ut.Mechanism) -> None:
-    a_e = next(p.value for p in arm.parameters if p.name == "a_e")
-    truth = arm.disturbed({"theta": 0.7 * a_e})
-    rig = RealisticRig(Bench(truth), [0.0, math.pi, 0.0, 0.0])
+    """A torque where the motor's is, as 0.7 V more than was asked for would make it."""
+
+    class Torque(RigWrapper):
+        def write(self, u: FloatArray) -> None:
+            super().write(u + 0.7)
+
+    rig = Torque(RealisticRig(Bench(arm), [0.0, math.pi, 0.0, 0.0]))
     kalman = KalmanFilter(arm, disturbance_drift=5.0)
     kalman.reset([0.0, math.pi, 0.0, 0.0])
     run_recorded(rig, kalman, lambda t, x: np.zeros(1), 2.0)

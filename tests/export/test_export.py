@@ -7,7 +7,7 @@ import math
 import re
 import shutil
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -42,6 +42,7 @@ from undertow.export import (
     SuperTwistingStep,
     Twin,
     files,
+    host,
 )
 from undertow.export.controller import checksums, plan_numbers
 from undertow.export.host import FLAGS, NEAREST, run_on_rig, tool
@@ -79,7 +80,15 @@ M = "two_motor_three_link"
 QUICK = {("rotary_pendulum", "double"), (M, "float"), ("gantry_crane", "double")}
 
 
-@lru_cache(maxsize=16)
+@pytest.fixture(scope="module", autouse=True)
+def written_once() -> Iterator[None]:
+    """What is written of a controller depends on it alone: tests that build the same share it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(host, "files", lru_cache(maxsize=64)(files))
+        yield
+
+
+@lru_cache(maxsize=64)
 def exported(name: str = "rotary_pendulum", **options: object) -> EmbeddedController:
     mechanism = LIBRARY[name]()
     surface = ut.first_surface(mechanism)

@@ -157,8 +157,8 @@ def test_a_motion_along_a_reference_is_that_of_the_equations() -> None:
         u = law(t, x - asked.state(t)).u
         return np.concatenate([x[2:], RIG.accelerations(t, x, u)])
 
-    solved = solve_ivp(rates, (0, 1.0), x0, rtol=1e-7, atol=1e-9, max_step=0.01)
-    run = simulate_along(loop, x0, Plan.of(SURFACE), asked, duration=1.0)
+    solved = solve_ivp(rates, (0, 0.5), x0, rtol=1e-7, atol=1e-9, max_step=0.01)
+    run = simulate_along(loop, x0, Plan.of(SURFACE), asked, duration=0.5)
     assert run.x[-1] == pytest.approx(solved.y[:, -1], abs=2e-4)
     far = simulate_along(loop, x0, Plan.of(SURFACE), asked, duration=4.0)
     assert far.event == Event.REACHED

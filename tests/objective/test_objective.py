@@ -305,8 +305,9 @@ def test_a_terminal_set_wider_than_the_range_is_refused() -> None:
         ut.MinimumTime().on(small)
     assert ut.MinimumTime(terminal_radius=1e-5).on(small).constraints
     for name, make in ut.mechanisms.LIBRARY.items():
+        mechanism = make()
         for goal in get_args(Goal):
-            assert objective_for(make(), goal).on(make()), (name, goal)
+            assert objective_for(mechanism, goal).on(mechanism), (name, goal)
     one_sided = replace(rail, low=0.0, high=1.0)  # the target is at its end: that is no fault
     assert ut.MinimumTime().on(replace(cart, coordinates=(one_sided, cart.coordinates[1])))
 

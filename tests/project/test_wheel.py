@@ -25,6 +25,8 @@ def _pythons() -> list[str]:
     versions = [f"3.{minor}" for minor in range(11, 20)]
     found = {f"{sys.version_info.major}.{sys.version_info.minor}": sys.executable}
     for version in versions:
+        if version in found:
+            continue
         pyenv = Path.home() / ".pyenv" / "versions"
         there = [shutil.which(f"python{version}"), *map(str, pyenv.glob(f"{version}.*/bin/python"))]
         for path in filter(None, there):

@@ -6,6 +6,7 @@ import copy
 import hashlib
 import json
 import math
+import os
 import random
 import re
 import shutil
@@ -45,9 +46,25 @@ Document = dict[str, Any]
 
 
 @pytest.fixture(scope="session")
-def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The checker as the Makefile builds it, but for the time that optimising takes."""
-    return build(tmp_path_factory.mktemp("checker"), "OPTIMISE=-Og")
+def program(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The checker as the Makefile builds it, but for the time that optimising takes.
+
+    It is kept for the next run, under a hash of all that it is made from.
+    """
+    folder, cache = tmp_path_factory.mktemp("checker"), getattr(pytestconfig, "cache", None)
+    if cache is None:  # with -p no:cacheprovider
+        return build(folder, "OPTIMISE=-Og")
+    parts = [ROOT / "Makefile", *sorted((ROOT / "checker").glob("*.?pp"))]
+    version = subprocess.run([str(COMPILER), "--version"], capture_output=True, check=True).stdout
+    key = hashlib.sha256(b"\0".join([version, *(part.read_bytes() for part in parts)]))
+    kept = Path(cache.mkdir("checker")) / key.hexdigest()[:32] / "undertow-checker"
+    if not kept.exists():
+        built = build(folder, "OPTIMISE=-Og")
+        kept.parent.mkdir(exist_ok=True)
+        whole = kept.with_name(f"{os.getpid()}.tmp")  # two workers may build it at once
+        shutil.copy(built, whole)
+        whole.replace(kept)
+    return kept
 
 
 def build(folder: Path, *words: str) -> Path:

@@ -110,7 +110,7 @@ def test_the_same_seed_gives_the_same_run_bit_for_bit(arm: ut.Mechanism) -> None
     x0 = arm.state(phi=0.4)
     cascade = ut.Cascade(
         arm,
-        objective_for(arm, "bench-energy"),
+        objective_for(arm, "effort"),
         warm=ut.Budget(64),
         cold=ut.Budget(256),
         belief="exact",
@@ -126,8 +126,8 @@ def test_the_same_seed_gives_the_same_run_bit_for_bit(arm: ut.Mechanism) -> None
 
 def test_a_cascade_is_tried_as_a_run_would_make_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Trials, campaigns and comparisons try on a bench what ``undertow run`` would run there."""
-    beam = ut.mechanisms.ball_and_beam()
-    recipe = Recipe(beam, rig="realistic")
+    arm = ut.mechanisms.rotary_pendulum()
+    recipe = Recipe(arm, rig="realistic", period=0.004)  # slow enough to ask for another layer
     suited, bench = recipe.cascade, recipe.bench
     begun: list[ut.Cascade] = []
 
@@ -136,10 +136,10 @@ def test_a_cascade_is_tried_as_a_run_would_make_it(monkeypatch: pytest.MonkeyPat
         return CascadeState(Plan.of(ut.first_surface(self.mechanism))), None
 
     monkeypatch.setattr(ut.Cascade, "start", start)
-    plain = ut.Cascade(beam, objective_for(beam, "bench-energy"))
-    cascade_and_kept(plain, bench, beam.usual_start)
+    plain = ut.Cascade(arm, objective_for(arm, "effort"))
+    cascade_and_kept(plain, bench, arm.usual_start)
     own = ut.ReachingLaw(30.0, 0.2)
-    cascade_and_kept(replace(plain, reaching=own), bench, beam.usual_start)
+    cascade_and_kept(replace(plain, reaching=own), bench, arm.usual_start)
     assert plain.reaching != suited.reaching == begun[0].reaching
     assert isinstance(begun[0].gate, BenchGate)
     assert repr(begun[0].gate) == repr(suited.gate)
