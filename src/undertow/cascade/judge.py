@@ -92,12 +92,13 @@ class Judge:
         return bool(arrives) and self.reserve.recovers(loop, error, span, plan)
 
     def soon(self, state: CascadeState, error: FloatArray, t: float, span: float) -> float:
-        """The time in which a plan to be mended is to be home, of the time ``span`` left, s.
+        """The time in which a plan that waits to be mended is to be home, of the ``span`` left, s.
 
         What no parameter of the model explains, as friction that it does not have, makes a motion
-        late: the more of the last one is unexplained, the more room a plan of a smooth cost leaves.
+        late: the more of the last one is unexplained, the more room a plan leaves.  With recourse
+        one of least time leaves none.
         """
-        if not self.recourse or self.predictions.prior.price_of_time > 0:
+        if self.recourse and self.predictions.prior.price_of_time > 0:
             return span
         rest = self.unexplained(state, error, t)
         return span / (1.0 + SOONER * max(0.0, rest - UNEXPLAINED))
