@@ -18,6 +18,7 @@ from undertow.cascade.robustness import (
     delay_margin,
     sticking_distance,
 )
+from undertow.closed_loop import Event
 from undertow.law import InnerLoop, Plan
 from undertow.objective import objective_for
 from undertow.plants import Bench, RealisticRig, Timing, plausible_rig, srv02_rig
@@ -196,6 +197,24 @@ def test_while_friction_is_large_soft_surfaces_are_refused(arm: ut.Mechanism) ->
     assert admission.accepted
     assert "in reserve" in admission.reason
     assert after.plan in cascade.reserve
+
+
+def test_a_plan_that_is_lost_later_stays_while_one_in_reserve_can_take_over(
+    arm: ut.Mechanism,
+) -> None:
+    """On one plausible plant it meets the singularity a second on: there is time to plan again."""
+    cascade = ut.Cascade(arm, objective_for(arm, "bench-energy"), covariance=1e-8 * np.eye(4))
+    soft, x = Plan.of(ut.Surface(-1, -0.32, 7.64, 39.6)), np.array([-3.04, -0.075, 0.34, 0.28])
+    motion = cascade.loop.batch(x, soft)
+    assert motion.event[0] == Event.SINGULAR
+    assert motion.time[0] > 10 * cascade.period
+    failed = ut.Proposal(None, "failed", np.inf, np.inf, (), 0, 0.0, 1, 0.0, "for the test")
+    after, admission = cascade.apply_gate(CascadeState(soft, x=tuple(x)), failed, x)
+    assert not admission.accepted
+    assert after.plan == soft
+    alone = ut.ClosedLoop(arm, cascade.objective).batch(x, soft).cost[0]
+    assert after.predicted == pytest.approx(alone, rel=1e-3)
+    assert cascade.loop.batch(x, cascade.reserve[0]).cost[0] > 2 * alone
 
 
 @pytest.mark.slow

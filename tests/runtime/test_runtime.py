@@ -36,6 +36,7 @@ from undertow.runtime import (
     replay,
     respond,
 )
+from undertow.runtime.controller import EARLY_LEAD
 from undertow.runtime.encoding import answer_from, answer_row
 from undertow.runtime.log import ANSWERS
 from undertow.runtime.modes import Reason, transition
@@ -457,14 +458,18 @@ def test_an_answer_that_was_damaged_on_its_way_is_refused(controller: Controller
 
 
 def test_an_answer_for_another_state_is_refused_at_its_time(controller: Controller) -> None:
+    """And the next one is asked for at once, for a moment that can be foreseen."""
     request, rig, k = asked(controller)
     answer = replace(answered(request, OTHER), x=np.full(4, 3.0))
-    texts = [given_to(controller, answer, 1e-3 * k, rig)]
+    texts, leads = [given_to(controller, answer, 1e-3 * k, rig)], []
     for i in range(k + 1, k + 110):
         rig.write(controller.step(Inputs(1e-3 * i, rig.read())))
         texts += [note.text for note in controller.notes]
+        if controller.request is not None:
+            leads.append(controller.request.use - controller.request.t)
     assert any("off its prediction" in text for text in texts)
     assert controller.memory.surface != OTHER
+    assert leads == pytest.approx([EARLY_LEAD])
 
 
 # -- other mechanisms ---------------------------------------------------------------------------
@@ -484,11 +489,11 @@ def test_a_slow_loop_is_optimised_as_a_quick_one_is(period: float, least: int) -
 def test_a_motor_that_is_faster_than_the_samples_is_run() -> None:
     """At 100 Hz the wheels' back-EMF, 241/s, made the estimate wrong and the pendulum fall.
 
-    With the usual budget: of 64 evaluations that for seed 0 falls after 5 s.  None of eight falls;
-    one may still roll to and fro after 10 s, for dry friction that no model here has.
+    With the usual budget: of 64 evaluations that for seed 0 falls after 5 s.  None of sixteen
+    falls; a few may still roll to and fro after 10 s, for dry friction that no model here has.
     """
     endings = []
-    for seed in range(8):
+    for seed in range(16):
         recipe = Recipe(
             "wheeled_inverted_pendulum",
             rig="realistic", period=0.01, seed=seed, objective="bench-energy",
@@ -496,7 +501,7 @@ def test_a_motor_that_is_faster_than_the_samples_is_run() -> None:
         with session(recipe, simulated=True) as runtime:
             endings.append(runtime.run(10.0).verdict.ending)
     assert set(endings) <= {"balanced", "caught"}
-    assert endings.count("balanced") >= 7
+    assert endings.count("balanced") >= 12
 
 
 @pytest.mark.slow

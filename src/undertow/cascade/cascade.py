@@ -557,11 +557,11 @@ class Cascade:
         since, the admission's reason says so: after a jump the cost is compared with that of a plan
         for another task, and "cost not raised" is little.
 
-        Where the plan in use does not suit every plausible plant and one in :attr:`reserve` does,
-        or is survived longer, that one is compared with, and takes over unless the proposal does.
-        For least time, where states are exact or with a schedule, it need not suit them: it is
-        judged on the estimate, as long as one in reserve would bring all of them home after the
-        next period.
+        A plan in use that brings the estimate home stays as long as one in :attr:`reserve` would
+        bring every plausible plant home after the next period.  Else, where it does not suit all of
+        them and one in reserve does, or is survived longer, that one is compared with, and takes
+        over unless the proposal does.  A proposal has to suit them all; but where states are exact,
+        or for least time with a schedule, it is judged as the plan in use is, both on the estimate.
 
         Where the target moves, what the gate admits is also rolled out along the reference, as is
         the plan in use: constraints have to hold there, and the cost must not rise.

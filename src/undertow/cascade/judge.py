@@ -66,12 +66,13 @@ class Judge:
     ) -> Plan:  # fmt: skip
         """The plan in use, or where it does not suit every plausible plant the best in reserve.
 
-        A plan with which a joint sticks suits none.  One that is to be mended need not suit all.
+        A plan with which a joint sticks suits none.  One that can be mended need not suit all: it
+        stays as long as there is time to take one in reserve a period later.
         """
         if loop.ensemble is None:
             return plan
         sticks = self._sticks(state, loop, plan) > 0
-        if not sticks and self.mendable(state, loop, plan, error, soon):
+        if not sticks and self._can_wait(state, loop, plan, error, soon):
             return plan
         better = self.reserve.better(loop, plan, error, span, sticks)
         return plan if better is None else better
@@ -79,20 +80,25 @@ class Judge:
     def mendable(
         self, state: CascadeState, loop: ClosedLoop, plan: Plan, error: FloatArray, span: float
     ) -> bool:
+        """Whether a plan is to be judged on the estimate, as one that later decisions mend."""
+        return self.recourse and self._can_wait(state, loop, plan, error, span)
+
+    def _can_wait(
+        self, state: CascadeState, loop: ClosedLoop, plan: Plan, error: FloatArray, span: float
+    ) -> bool:
         """Whether a plan brings the estimate home, and may be mended for the plant later on."""
-        if not self.recourse:
-            return False
         estimated = self.predictions.estimated_at(state)
         arrives = estimated.batch(error, plan, duration=span, precise=True).reached[0]
         return bool(arrives) and self.reserve.recovers(loop, error, span, plan)
 
     def soon(self, state: CascadeState, error: FloatArray, t: float, span: float) -> float:
-        """The time in which a plan to be mended is to be home, of the time ``span`` left, s.
+        """The time in which a plan that waits to be mended is to be home, of the ``span`` left, s.
 
         What no parameter of the model explains, as friction that it does not have, makes a motion
-        late: the more of the last one is unexplained, the more room a plan of a smooth cost leaves.
+        late: the more of the last one is unexplained, the more room a plan leaves.  With recourse
+        one of least time leaves none.
         """
-        if not self.recourse or self.predictions.prior.price_of_time > 0:
+        if self.recourse and self.predictions.prior.price_of_time > 0:
             return span
         rest = self.unexplained(state, error, t)
         return span / (1.0 + SOONER * max(0.0, rest - UNEXPLAINED))
@@ -191,7 +197,8 @@ class Judge:
             if proposal.plan is not None:
                 reason = f"some plausible plant would not come home after another period{jump}"
             admission = replace(kept, accepted=False, reason=reason)
-            return replace(state, predicted=kept.cost), _reserved(admission, old, used)
+            predicted = self._predicted(state, old, error, span, kept.cost)
+            return replace(state, predicted=predicted), _reserved(admission, old, used)
         admission = self.ask(judge, old, proposal.plan, error, span)
         off = self._sticks(state, loop, proposal.plan) if admission.accepted else 0.0
         if off > self._sticks(state, loop, old):
@@ -209,8 +216,16 @@ class Judge:
             admission = self._along(state, old, proposal.plan, admission, span)
         admission = replace(admission, reason=f"{admission.reason}{jump}")
         plan = proposal.plan if admission.accepted else old
-        admission = _reserved(admission, plan, used)
-        return replace(state, plan=plan, predicted=admission.cost), admission
+        predicted = self._predicted(state, plan, error, span, admission.cost)
+        return replace(state, plan=plan, predicted=predicted), _reserved(admission, plan, used)
+
+    def _predicted(
+        self, state: CascadeState, plan: Plan, error: FloatArray, span: float, cost: float
+    ) -> float:
+        """What a plan in use is predicted to cost: on the estimate where it does not suit all."""
+        if cost < math.inf:
+            return cost
+        return self.ask(self.predictions.estimated_at(state), plan, plan, error, span).cost
 
     def _along(
         self, state: CascadeState, old: Plan, new: Plan, admission: Admission, span: float

@@ -246,7 +246,7 @@ class Planning:
                 "computed_for": t,
                 "resolution": self.resolution * state.scale,
             }
-            horizons = [soon, horizon] if soon < span else [horizon]
+            horizons = [soon, horizon] if planners.recourse and soon < span else [horizon]
             asks = [ask | {"horizon": longest} for longest in horizons]
             mended = self._mended(state, error, t, soon, asks[0])
             if mended is not None:

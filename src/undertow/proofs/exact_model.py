@@ -16,6 +16,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
+from undertow.base.arguments import require
 from undertow.base.errors import InvalidInputError
 from undertow.models.mechanism import TIME, Mechanism
 from undertow.models.validity import require_smooth
@@ -77,3 +78,10 @@ def is_odd(
     flip = {x: -x for x in symbols}
     rest = [e - e.xreplace(flip) for e in even] + [e + e.xreplace(flip) for e in odd]
     return all(sp.expand(e) == 0 for e in rest)
+
+
+def require_autonomous(mechanism: Mechanism, proved: str) -> None:
+    """Refuse a force that depends on time."""
+    remedy = f"Prove the {proved} for the undisturbed mechanism"
+    good = TIME not in mechanism.force.free_symbols
+    require(good, f"force of '{mechanism.name}'", "depends on time", "autonomous", remedy)

@@ -664,6 +664,7 @@ class Controller:
             verdict = f"kept the old plan, {answer.admission.reason}"
         elif not off <= most:
             verdict = f"refused, the state is off its prediction by {off:.2g}"
+            self._early = answer.swing < 0 and not answer.jump
         elif not margin > self.settings.min_margin:
             verdict = f"refused, det Γ(q)/det Γ(0) would be {margin:.2g}"
         else:

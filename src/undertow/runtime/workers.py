@@ -88,10 +88,11 @@ class Worker(Protocol[Asked_contra, Said_co]):
 class InlineWorker:
     """Computes at once, and answers after a latency of simulated time.
 
-    ``latency`` is the simulated time from request to answer, s.
+    ``latency`` is the simulated time from request to answer, s: by default less than
+    :data:`undertow.runtime.controller.EARLY_LEAD`, as most answers take.
     """
 
-    def __init__(self, compute: Compute, latency: float = 0.05) -> None:
+    def __init__(self, compute: Compute, latency: float = 0.015) -> None:
         self.compute, self.latency = compute, latency
         self.waiting: deque[tuple[float, Answer]] = deque()
 

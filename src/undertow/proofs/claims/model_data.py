@@ -18,10 +18,9 @@ from undertow.base.errors import CertificateError, ModelError
 from undertow.law import ReachingLaw, Surface, check_surface_shape
 from undertow.models.mechanism import TIME, Mechanism
 from undertow.proofs.claims.written import number_text
-from undertow.proofs.exact_model import exact_mechanism, exact_number
+from undertow.proofs.exact_model import exact_mechanism, exact_number, require_autonomous
 from undertow.proofs.kernel.model import Law, Model
 from undertow.proofs.kernel.reader import Refused, read_law, read_model
-from undertow.proofs.require import require_autonomous
 
 _PLAIN = {sp.sin: "sin", sp.cos: "cos", sp.exp: "exp", sp.log: "log", sp.tanh: "tanh"}
 

@@ -22,12 +22,12 @@ from undertow.models.mechanism import FloatArray, Mechanism
 from undertow.proofs.claims.claim import Claim
 from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.claims.words import limits_words, sentence, verdict_on
+from undertow.proofs.exact_model import require_autonomous
 from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.compiled import between
 from undertow.proofs.kernel.graph import Graph, Intervals, Span
 from undertow.proofs.kernel.loop import ellipsoid
 from undertow.proofs.kernel.model import Law, Model, System
-from undertow.proofs.require import require_autonomous
 
 
 @dataclass(frozen=True, eq=False)

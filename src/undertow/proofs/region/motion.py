@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike
 from undertow.base.arguments import require
 from undertow.law import Surface, check_surface_shape
 from undertow.models.mechanism import FloatArray, Mechanism, Parameter
-from undertow.proofs.exact_model import exact_matrix, exact_mechanism, is_odd
-from undertow.proofs.require import require_autonomous
+from undertow.proofs.exact_model import exact_matrix, exact_mechanism, is_odd, require_autonomous
 from undertow.symbolic import Tape, compile_numpy
 
 
