@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -10,7 +11,13 @@ import scipy.linalg
 
 import undertow as ut
 from undertow.base import InvalidInputError
-from undertow.cascade import CascadeState, cost_gate, noise_share, robustness_gate
+from undertow.cascade import (
+    CascadeState,
+    cost_gate,
+    derate_actuator,
+    noise_share,
+    robustness_gate,
+)
 from undertow.cascade.robustness import (
     BenchGate,
     DelayGate,
@@ -197,6 +204,25 @@ def test_while_friction_is_large_soft_surfaces_are_refused(arm: ut.Mechanism) ->
     assert admission.accepted
     assert "in reserve" in admission.reason
     assert after.plan in cascade.reserve
+
+
+@pytest.mark.parametrize("belief", ["usual", "exact"])
+def test_a_derated_loop_moves_the_plant_with_weaker_motors(
+    belief: Literal["usual", "exact"], arm: ut.Mechanism
+) -> None:
+    """Of an ensemble it is the believed plant alone; other kernels, of a plant given, say so."""
+    objective, plan = ut.MinimumEnergy(), Plan.of(ut.first_surface(arm))
+    loop = ut.Cascade(arm, objective, belief=belief).loop
+    weak = derate_actuator(loop, 0.3)
+    plant = arm.with_input_limit(*0.7 * arm.input_limits)
+    given = ut.ClosedLoop(arm, objective, loop.reaching, plant=plant)
+    whole = ut.ClosedLoop(arm, objective, loop.reaching)
+    for phi in (0.6, 0.7, 0.9):
+        x = arm.state(phi=phi)
+        ends = [one.batch(x, plan, duration=0.2, terminal=0.0) for one in (weak, given, whole)]
+        assert ends[0].event[0] == ends[1].event[0]
+        assert ends[0].x == pytest.approx(ends[1].x, rel=1e-9, abs=1e-12)
+        assert ends[0].x != pytest.approx(ends[2].x, rel=1e-3)
 
 
 def test_a_plan_that_is_lost_later_stays_while_one_in_reserve_can_take_over(

@@ -72,10 +72,12 @@ class Judge:
         if loop.ensemble is None:
             return plan
         sticks = self._sticks(state, loop, plan) > 0
-        if not sticks and self._can_wait(state, loop, plan, error, soon):
+        if not sticks and self.mendable(state, loop, plan, error, soon):
             return plan
         better = self.reserve.better(loop, plan, error, span, sticks)
-        return plan if better is None else better
+        if better is None or (not sticks and self._can_wait(state, loop, plan, error, soon)):
+            return plan
+        return better
 
     def mendable(
         self, state: CascadeState, loop: ClosedLoop, plan: Plan, error: FloatArray, span: float

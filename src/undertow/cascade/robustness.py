@@ -18,7 +18,7 @@ from functools import lru_cache
 import numpy as np
 
 from undertow.base import InvalidInputError
-from undertow.closed_loop import INADMISSIBLE, ClosedLoop, Event
+from undertow.closed_loop import INADMISSIBLE, ClosedLoop, Ensemble, Event
 from undertow.closed_loop.gate import Admission, cost_gate, gate_words
 from undertow.law import Plan, ReachingLaw, Surface, feedback_at_target
 from undertow.models import FloatArray, Mechanism, linearise
@@ -233,10 +233,15 @@ def _refused(loop: ClosedLoop, old: Plan, x: FloatArray, horizon: float, why: st
 
 
 def derate_actuator(loop: ClosedLoop, reserve: float) -> ClosedLoop:
-    """Return the loop on the believed plant with input limits that are lower by a part of them."""
-    limits = (1.0 - reserve) * loop.mechanism.input_limits
-    weak = loop.mechanism.with_input_limit(*limits)
-    return replace(loop, plant=weak, ensemble=None, tail_rtol=0.0)
+    """Return the loop on the believed plant with input limits that are lower by a part of them.
+
+    An ensemble becomes that plant alone: the kernels stay, and nothing has to be looked up.
+    """
+    if loop.plant is not None:
+        loop = replace(loop, plant=None)
+    weak = loop.mechanism.with_input_limit(*(1.0 - reserve) * loop.mechanism.input_limits)
+    only = loop.ensemble and Ensemble(loop.ensemble.plant, weak.parameter_values[None])
+    return loop.believing(weak, only or None).with_steps(loop.step, 0.0)
 
 
 @dataclass(frozen=True, eq=False)

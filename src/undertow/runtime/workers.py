@@ -89,7 +89,7 @@ class InlineWorker:
     """Computes at once, and answers after a latency of simulated time.
 
     ``latency`` is the simulated time from request to answer, s: by default less than
-    :data:`undertow.runtime.controller.EARLY_LEAD`, as most answers take.
+    :data:`undertow.runtime.controller.EARLY_LEAD`, so that what is asked for so soon is in time.
     """
 
     def __init__(self, compute: Compute, latency: float = 0.015) -> None:
