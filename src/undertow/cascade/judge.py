@@ -100,6 +100,8 @@ class Judge:
         late: the more of the last one is unexplained, the more room a plan leaves.  With recourse
         one of least time leaves none.
         """
+        if self.predictions.belief is None:  # nothing waits
+            return span
         if self.recourse and self.predictions.prior.price_of_time > 0:
             return span
         rest = self.unexplained(state, error, t)
