@@ -75,9 +75,10 @@ class Judge:
         if not sticks and self.mendable(state, loop, plan, error, soon):
             return plan
         better = self.reserve.better(loop, plan, error, span, sticks)
-        if better is None or (not sticks and self._can_wait(state, loop, plan, error, soon)):
+        if better is None:
             return plan
-        return better
+        asked = sticks or self.recourse  # with recourse it was asked above
+        return plan if not asked and self._can_wait(state, loop, plan, error, soon) else better
 
     def mendable(
         self, state: CascadeState, loop: ClosedLoop, plan: Plan, error: FloatArray, span: float
@@ -100,9 +101,8 @@ class Judge:
         late: the more of the last one is unexplained, the more room a plan leaves.  With recourse
         one of least time leaves none.
         """
-        if self.predictions.belief is None:  # nothing waits
-            return span
-        if self.recourse and self.predictions.prior.price_of_time > 0:
+        least_time = self.recourse and self.predictions.prior.price_of_time > 0
+        if self.predictions.belief is None or least_time:
             return span
         rest = self.unexplained(state, error, t)
         return span / (1.0 + SOONER * max(0.0, rest - UNEXPLAINED))

@@ -240,8 +240,10 @@ def derate_actuator(loop: ClosedLoop, reserve: float) -> ClosedLoop:
     if loop.plant is not None:
         loop = replace(loop, plant=None)
     weak = loop.mechanism.with_input_limit(*(1.0 - reserve) * loop.mechanism.input_limits)
-    only = loop.ensemble and Ensemble(loop.ensemble.plant, weak.parameter_values[None])
-    return loop.believing(weak, only or None).with_steps(loop.step, 0.0)
+    ensemble = None
+    if loop.ensemble is not None:
+        ensemble = Ensemble(loop.ensemble.plant, weak.parameter_values[None])
+    return loop.believing(weak, ensemble).with_steps(loop.step, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
