@@ -13,7 +13,7 @@ from undertow.cascade.predictions import Predictions, costs_along
 from undertow.cascade.reserve import Reserve
 from undertow.cascade.robustness import sticking_distance
 from undertow.cascade.state import CascadeState, as_numbers
-from undertow.closed_loop import ClosedLoop, Event
+from undertow.closed_loop import INADMISSIBLE, ClosedLoop, Event
 from undertow.closed_loop.gate import Admission, Gate, broken_by
 from undertow.law import Plan
 from undertow.models import FloatArray
@@ -29,6 +29,10 @@ JUMP, PART = 0.1, 0.5
 #: much sooner a plan to be mended is to be home where all of it is; and what part of the distance
 #: left is no motion.
 UNEXPLAINED, SOONER, STILL = 0.03, 5.0, 1e-3
+
+#: What part of the error of the last prediction, in cost, another plan has to gain where states are
+#: estimated: less is within what predictions are off, and every change of a surface has its price.
+RESOLVED = 0.3
 
 
 class Judge:
@@ -58,7 +62,7 @@ class Judge:
         guarded = objective.hard_input or predictions.prior.objective != objective
         self._bounds_input = predictions.belief is not None and guarded
         # A decision asks twice, for the search and for the gate.
-        self._unexplained = lru_cache(maxsize=2)(self._part_unexplained)
+        self._moved = lru_cache(maxsize=2)(_moved)
 
     def standing(
         self, state: CascadeState, loop: ClosedLoop, plan: Plan, error: FloatArray, span: float,
@@ -113,21 +117,43 @@ class Judge:
         How far positions are off where it says that the plan in use moved them, beside that way.
         Along a reference that moves nothing is said: 0.
         """
-        past, moves = t - state.since, state.target is not None and state.target.moves
-        if moves or not state.x or not 0.0 < past <= self.objective.horizon:
+        there = self._expected(state, t)
+        if there is None:
             return 0.0
-        loop = self.predictions.estimated_at(state)
-        return self._unexplained(loop, state.plan, state.x, error.tobytes(), past)
-
-    @staticmethod
-    def _part_unexplained(
-        loop: ClosedLoop, plan: Plan, x: tuple[float, ...], error: bytes, past: float
-    ) -> float:
-        n, start, end = loop.mechanism.n, np.array(x), np.frombuffer(error)
-        there = loop.batch(start, plan, duration=past, terminal=0.0, precise=True).x[0]
-        off, way, left = (np.linalg.norm(d[:n]) for d in (end - there, there - start, end))
+        n, start = len(there) // 2, np.array(state.x)
+        off, way, left = (np.linalg.norm(d[:n]) for d in (error - there, there - start, error))
         way += STILL * left
         return float(off / way) if math.isfinite(off) and way > 0.0 else 0.0
+
+    def _expected(self, state: CascadeState, t: float) -> FloatArray | None:
+        """Where the estimate says that the plan in use has brought the state by t.
+
+        ``None`` along a reference that moves, and where that decision is not known or long past.
+        """
+        past, moves = t - state.since, state.target is not None and state.target.moves
+        if moves or not state.x or not 0.0 < past <= self.objective.horizon:
+            return None
+        return self._moved(self.predictions.estimated_at(state), state.plan, state.x, past)
+
+    def _resolved(
+        self, admission: Admission, loop: ClosedLoop, old: Plan, x: FloatArray,
+        there: FloatArray, span: float,
+    ) -> Admission:  # fmt: skip
+        """Admit what gains more than ``RESOLVED`` of what the last prediction was off, in cost.
+
+        ``there`` is where the estimate says that x would be by now.
+        """
+        if not np.isfinite(there).all():
+            return admission
+        starts = np.array([there, x])
+        foreseen, now = loop.batch(starts, [old, old], duration=span, precise=True).score(span)
+        off = min(
+            abs(foreseen - now), now
+        )  # from a bad prediction a plan that is much better saves
+        if max(foreseen, now) >= INADMISSIBLE or now - admission.cost >= RESOLVED * off:
+            return admission
+        words = f"gains {now - admission.cost:.3g}, when the last prediction was {off:.3g} off"
+        return Admission(False, words, float(now), admission.verdict)
 
     def breaks(
         self, state: CascadeState, plans: list[Plan], error: FloatArray, span: float
@@ -186,6 +212,9 @@ class Judge:
         jump = self._jump(state, t, error)
         loop = self.predictions.at(state, t)
         used, soon = state.at(t), self.soon(state, error, t, span)
+        # Exact states have no such doubts; there, and for least time, later decisions mend a plan.
+        doubted = self.predictions.belief is not None and not self.recourse
+        there = self._expected(state, t) if doubted else None
         old = self.standing(replace(state, since=t), loop, used, error, span, soon)
         state = replace(
             state, plan=old, since=t, sequence=proposal.sequence, x=as_numbers(error), ahead=None
@@ -204,6 +233,8 @@ class Judge:
             predicted = self._predicted(state, old, error, span, kept.cost)
             return replace(state, predicted=predicted), _reserved(admission, old, used)
         admission = self.ask(judge, old, proposal.plan, error, span)
+        if admission.accepted and old is used and there is not None:
+            admission = self._resolved(admission, judge, old, error, there, span)
         off = self._sticks(state, loop, proposal.plan) if admission.accepted else 0.0
         if off > self._sticks(state, loop, old):
             cost = self.ask(loop, old, old, error, span).cost
@@ -266,6 +297,12 @@ class Judge:
         """Whether every plausible plant lives to see the next decisions with a plan."""
         event = loop.batch(error, plan, duration=2 * self.period).event[0]
         return event in (Event.HORIZON, Event.REACHED)
+
+
+def _moved(loop: ClosedLoop, plan: Plan, x: tuple[float, ...], past: float) -> FloatArray:
+    """Where a plan brings the state x, (2n,), in a time, s; NaN where the motion breaks off."""
+    motion = loop.batch(np.array(x), plan, duration=past, terminal=0.0, precise=True)
+    return np.asarray(motion.x[0])
 
 
 def _reserved(admission: Admission, plan: Plan, used: Plan) -> Admission:
