@@ -16,6 +16,7 @@ from undertow.base import InfeasibleError, InvalidInputError
 from undertow.cascade import Admission, CascadeState, cost_gate
 from undertow.cascade.simulation import moving_loops
 from undertow.estimators import KalmanFilter, Measured, ParameterEstimate
+from undertow.objective import objective_for
 
 SPREAD = {"m": 0.2, "l": 0.05, "I_e": 0.2, "a_e": 0.1, "d_e": 0.5}
 
@@ -460,6 +461,37 @@ def test_what_is_best_for_the_estimate_is_in_use_while_it_can_be_mended(
         after, _ = made.apply_gate(memory, proposal, x, left)
         motion = made.loop.batch(x, after.plan, duration=left)
         assert motion.reached[0] == (not mendable)
+
+
+def test_on_a_bench_a_plan_gives_way_only_to_what_predictions_can_tell_from_it(
+    pendulum: ut.Mechanism,
+) -> None:
+    """What is cheaper by less than three tenths of the last prediction's error is not taken."""
+    objective, x = objective_for(pendulum), pendulum.state(phi=0.3)
+    belief, t = ut.Belief.relative(pendulum, **SPREAD), 0.1
+    bench = ut.Cascade(pendulum, objective, belief=belief, covariance=1e-8 * np.eye(4))
+    exact = ut.Cascade(pendulum, objective, belief=belief)
+    assert bench.known is not None
+    used = bench.start(x)[0].plan
+    memory = CascadeState(used, x=tuple(x.tolist()), estimate=bench.known.prior)
+    there = ut.ClosedLoop(pendulum, objective).simulate(x, used, duration=t).x[-1]
+    admitted = []
+    for off in (0.0, 0.001, 0.03, -0.03):
+        now = there + pendulum.state(phi=off)
+        before, cost = (bench.loop.batch(at, used).cost[0] for at in (there, now))
+        proposal = bench.propose(memory, now, t)
+        gain = cost - bench.loop.batch(now, proposal.plan).cost[0]
+        assert gain > 0
+        after, admission = bench.apply_gate(memory, proposal, now)
+        assert admission.accepted == (gain >= 0.3 * abs(cost - before))
+        assert after.predicted == pytest.approx(cost - gain * admission.accepted, rel=1e-6)
+        assert admission.accepted or admission.reason.startswith("gains ")
+        assert after.plan == (proposal.plan if admission.accepted else used)
+        admitted.append(admission.accepted)
+        # Exact states have no such doubt: there the gain that is predicted is what counts.
+        alone = exact.propose(memory, now, t)
+        assert exact.apply_gate(memory, alone, now)[1].accepted
+    assert set(admitted) == {True, False}
 
 
 def rubbing(pendulum: ut.Mechanism, friction: float) -> ut.Mechanism:

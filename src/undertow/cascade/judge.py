@@ -60,6 +60,8 @@ class Judge:
         self.objective, self.recourse = objective, recourse
         self.reaching, self.period = reserve.reaching, reserve.period
         guarded = objective.hard_input or predictions.prior.objective != objective
+        on_bench = predictions.belief is not None and predictions.prior.covariance is not None
+        self._doubts = on_bench and not recourse
         self._bounds_input = predictions.belief is not None and guarded
         # A decision asks twice, for the search and for the gate.
         self._moved = lru_cache(maxsize=2)(_moved)
@@ -135,25 +137,37 @@ class Judge:
             return None
         return self._moved(self.predictions.estimated_at(state), state.plan, state.x, past)
 
-    def _resolved(
-        self, admission: Admission, loop: ClosedLoop, old: Plan, x: FloatArray,
-        there: FloatArray, span: float,
-    ) -> Admission:  # fmt: skip
-        """Admit what gains more than ``RESOLVED`` of what the last prediction was off, in cost.
+    def _gains_little(
+        self, state: CascadeState, loop: ClosedLoop, cost: float, x: FloatArray,
+        there: FloatArray | None, span: float,
+    ) -> str:  # fmt: skip
+        """Say so where a plan gains less than ``RESOLVED`` of the last prediction's error, in cost.
 
-        ``there`` is where the estimate says that x would be by now.
+        ``there`` is where the estimate says that x would be by now; ``None``: nobody doubts it.
         """
-        if not np.isfinite(there).all():
-            return admission
-        starts = np.array([there, x])
+        if there is None or not np.isfinite(there).all():
+            return ""
+        old, starts = state.plan, np.array([there, x])
         foreseen, now = loop.batch(starts, [old, old], duration=span, precise=True).score(span)
-        off = min(
-            abs(foreseen - now), now
-        )  # from a bad prediction a plan that is much better saves
-        if max(foreseen, now) >= INADMISSIBLE or now - admission.cost >= RESOLVED * off:
-            return admission
-        words = f"gains {now - admission.cost:.3g}, when the last prediction was {off:.3g} off"
-        return Admission(False, words, float(now), admission.verdict)
+        off = min(abs(foreseen - now), now)  # a plan that saves much of the cost is always better
+        if max(foreseen, now) >= INADMISSIBLE or now - cost >= RESOLVED * off:
+            return ""
+        if math.isfinite(self.breaks(state, [old], x, span)[0][0]):
+            return ""
+        return f"gains {now - cost:.3g}, when the last prediction was {off:.3g} off"
+
+    def _frees_too_late(self, state: CascadeState, loop: ClosedLoop, new: Plan) -> str:
+        """Say so where a joint sticks farther off with a new plan than with the one in use."""
+        off = self._sticks(state, loop, new)
+        if not off > self._sticks(state, loop, state.plan):
+            return ""
+        most = f"{self.objective.terminal_radius:g} at most"
+        return f"a joint that sticks is freed by {off:.3g} of the others, {most}"
+
+    def _breaks_sooner(self, state: CascadeState, new: Plan, error: FloatArray, span: float) -> str:
+        """Say so where a plan breaks a constraint on the estimate before the one in use does."""
+        (before, _), (end, name) = self.breaks(state, [state.plan, new], error, span)
+        return f"breaks {name} between two steps, at {end:.3g} s" if end < before else ""
 
     def breaks(
         self, state: CascadeState, plans: list[Plan], error: FloatArray, span: float
@@ -212,9 +226,7 @@ class Judge:
         jump = self._jump(state, t, error)
         loop = self.predictions.at(state, t)
         used, soon = state.at(t), self.soon(state, error, t, span)
-        # Exact states have no such doubts; there, and for least time, later decisions mend a plan.
-        doubted = self.predictions.belief is not None and not self.recourse
-        there = self._expected(state, t) if doubted else None
+        there = self._expected(state, t) if self._doubts else None
         old = self.standing(replace(state, since=t), loop, used, error, span, soon)
         state = replace(
             state, plan=old, since=t, sequence=proposal.sequence, x=as_numbers(error), ahead=None
@@ -233,19 +245,15 @@ class Judge:
             predicted = self._predicted(state, old, error, span, kept.cost)
             return replace(state, predicted=predicted), _reserved(admission, old, used)
         admission = self.ask(judge, old, proposal.plan, error, span)
-        if admission.accepted and old is used and there is not None:
-            admission = self._resolved(admission, judge, old, error, there, span)
-        off = self._sticks(state, loop, proposal.plan) if admission.accepted else 0.0
-        if off > self._sticks(state, loop, old):
-            cost = self.ask(loop, old, old, error, span).cost
-            most = f"{self.objective.terminal_radius:g} at most"
-            words = f"a joint that sticks is freed by {off:.3g} of the others, {most}"
-            admission = Admission(False, words, cost)
         if admission.accepted:
-            (before, _), (end, name) = self.breaks(state, [old, proposal.plan], error, span)
-            if end < before:
+            doubted = there if old is used else None
+            words = (
+                self._gains_little(state, judge, admission.cost, error, doubted, span)
+                or self._frees_too_late(state, loop, proposal.plan)
+                or self._breaks_sooner(state, proposal.plan, error, span)
+            )
+            if words:
                 cost = self.ask(loop, old, old, error, span).cost
-                words = f"breaks {name} between two steps, at {end:.3g} s"
                 admission = Admission(False, words, cost)
         if state.target is not None and state.target.moves:
             admission = self._along(state, old, proposal.plan, admission, span)
