@@ -480,6 +480,7 @@ def test_on_a_bench_a_plan_gives_way_only_to_what_predictions_can_tell_from_it(
         now = there + pendulum.state(phi=off)
         before, cost = (bench.loop.batch(at, used).cost[0] for at in (there, now))
         proposal = bench.propose(memory, now, t)
+        assert proposal.plan is not None
         gain = cost - bench.loop.batch(now, proposal.plan).cost[0]
         assert gain > 0
         after, admission = bench.apply_gate(memory, proposal, now)
