@@ -147,6 +147,25 @@ def test_a_cascade_is_tried_as_a_run_would_make_it(monkeypatch: pytest.MonkeyPat
     assert begun[1].reaching == own
 
 
+def test_a_trial_begins_with_the_reaching_law_that_was_found(arm: ut.Mechanism) -> None:
+    """Cascade and kept plan act at the start as the plan says, whose gains and layers are free."""
+    free = ut.Cascade(
+        arm, objective_for(arm), freedom=ut.DecisionVariables(reaching=True), cold=ut.Budget(256)
+    )
+    x0 = arm.state(phi=0.3)
+    makers = cascade_and_kept(free, srv02_rig(), x0)
+    steering = makers[0](x0)
+    assert isinstance(steering, CascadeSteering)
+    plan = steering.memory.plan
+    assert plan.reaching
+    assert plan.reaching[0] != steering.cascade.reaching
+    expected = steering.cascade.control(steering.memory, 0.0, x0).u
+    usual = ut.SlidingModeLaw(arm, plan.surfaces[0], steering.cascade.reaching)(0.0, x0).u
+    assert abs(usual - expected) > 0.1
+    for make in makers:
+        assert make(x0)(0.0, x0) == pytest.approx(expected, rel=1e-9)
+
+
 def test_plants_with_the_same_sensors_share_one_search(
     arm: ut.Mechanism, monkeypatch: pytest.MonkeyPatch
 ) -> None:

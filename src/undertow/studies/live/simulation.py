@@ -574,7 +574,8 @@ class Simulation:
     def _limit(self, limits: tuple[float, ...]) -> None:
         """Let law and plant have other limits of the inputs."""
         before = self.law
-        self.law = InnerLoop(self.mechanism.with_input_limit(*limits), before.surface)
+        limited = self.mechanism.with_input_limit(*limits)
+        self.law = InnerLoop(limited, before.surface, before.reaching)
         self.law.lane = before.lane
         self.law.parameters[:] = before.parameters
 

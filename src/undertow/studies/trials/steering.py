@@ -19,7 +19,7 @@ from undertow.base import InvalidInputError, require_extra
 from undertow.bounds.expressions import dynamics
 from undertow.cascade import Cascade, CascadeState
 from undertow.estimators import Estimator, StateFeedback
-from undertow.law import InnerLoop, ReachingLaw, Surface
+from undertow.law import InnerLoop, Plan, ReachingLaw, Surface
 from undertow.models import (
     UNCONTROLLABLE,
     FloatArray,
@@ -38,13 +38,19 @@ from undertow.studies.trials.trial import MakeController
 
 
 def keeping(
-    mechanism: Mechanism, surface: Surface, reaching: ReachingLaw = ReachingLaw()
+    mechanism: Mechanism, kept: Surface | Plan, reaching: ReachingLaw = ReachingLaw()
 ) -> MakeController:
-    """Return the maker of a controller that keeps one surface."""
+    """Return the maker of a controller that keeps one surface, or one plan with its own laws."""
+    plan = kept if isinstance(kept, Plan) else Plan.of(kept)
 
     def make(_start: FloatArray) -> StateFeedback:
-        law = InnerLoop(mechanism, surface, reaching)
-        return lambda t, x: law(x)
+        law = InnerLoop(mechanism, plan.surfaces[0], reaching)
+
+        def control(t: float, x: FloatArray) -> FloatArray:
+            law.follow(plan, t, reaching)
+            return law(x)
+
+        return control
 
     return make
 
@@ -66,6 +72,7 @@ class CascadeSteering:
         self.cascade = cascade
         self.memory = start[0]
         self.law = InnerLoop(cascade.mechanism, self.memory.surface, cascade.reaching)
+        self._use(self.memory.since)
         self.waiting: Proposal | None = None
         self.ticks = self.admitted = self.refused = 0
         self.began = 0.0
@@ -145,7 +152,7 @@ def cascade_and_kept(
     suited = for_rig(cascade, known)
     state, proposal = suited.start(x0)
     start = suited.prepared(state, x0), proposal
-    kept = keeping(suited.mechanism, start[0].surface, suited.reaching)
+    kept = keeping(suited.mechanism, start[0].plan, suited.reaching)
     return lambda _: CascadeSteering(suited, start), kept
 
 
