@@ -104,6 +104,17 @@ def test_each_surface_of_a_run_is_certified(run: ut.Run) -> None:
         assert {"stability"} <= {claim.kind for claim in item.subject.claims}
 
 
+def test_a_run_is_certified_with_the_reaching_laws_of_its_plans(run: ut.Run) -> None:
+    """Where a cascade chose gains and layers, the claims are about those."""
+    own = ut.ReachingLaw(30.0, 0.5)
+    update = run.updates[0]
+    plan = replace(update.plan, reaching=(own,) * len(update.plan.surfaces))
+    twice = replace(run, updates=(update, replace(update, plan=plan)))
+    certified = certify_run(RIG, twice)
+    assert [c.subject.reaching for c in certified] == [ut.ReachingLaw(), own]
+    assert len({c.subject.surface for c in certified}) == 1
+
+
 def test_the_papers_cases_at_once() -> None:
     cases = certify_appendix(ut.mechanisms.rotary_pendulum())
     shown = text(appendix_report(cases))

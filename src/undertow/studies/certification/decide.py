@@ -338,21 +338,23 @@ def certify_run(
 ) -> tuple[Certified, ...]:
     """Decide stability and a terminal set for every surface that a run applied, in order.
 
-    ``reaching_law`` is that of the cascade that ran. The admissions' verdicts become remarks of the
-    surface that they admitted; ``kept`` is as for :func:`certify_surface`.
+    ``reaching_law`` is that of the cascade that ran, for plans that have none of their own. The
+    admissions' verdicts become remarks of the surface that they admitted; ``kept`` is as for
+    :func:`certify_surface`.
     """
-    seen: dict[Surface, list[Verdict]] = {}
+    seen: dict[tuple[Surface, ReachingLaw], list[Verdict]] = {}
     for update in run.updates:
-        verdicts = seen.setdefault(update.plan.surfaces[-1], [])
+        last = update.plan.surfaces[-1], update.plan.laws(reaching_law)[-1]
+        verdicts = seen.setdefault(last, [])
         if update.admission.accepted and update.admission.verdict is not None:
             verdicts.append(update.admission.verdict)
     certified: list[Certified] = []
-    for surface in each(seen, progress, lambda _: "surfaces of the run"):
+    for (surface, law), verdicts in each(seen.items(), progress, lambda _: "surfaces of the run"):
         base = certify_surface(
             mechanism, surface, np.zeros(2 * mechanism.n), title=f"surface {len(certified) + 1}",
-            reaching_law=reaching_law, seconds=0.0, predict=False, kept=kept,
+            reaching_law=law, seconds=0.0, predict=False, kept=kept,
         )  # fmt: skip
-        remarks = (*base.subject.remarks, *(v for v in seen[surface] if not v))
+        remarks = (*base.subject.remarks, *(v for v in verdicts if not v))
         certified.append(replace(base, subject=replace(base.subject, remarks=remarks)))
     return tuple(certified)
 
