@@ -158,7 +158,7 @@ class SearchSpace:
             switching = self.loop.reaching.switching
             laws = tuple(
                 ReachingLaw(tuple(row[: self.m]), tuple(row[self.m :]), switching)
-                for row in gains[0]
+                for row in gains[0].tolist()
             )
         return Plan(surfaces, self.freedom.times, laws)
 

@@ -111,7 +111,7 @@ class CascadeSteering:
         self.law.follow(plan, 0.0, self.cascade.reaching)
         self.law(x)
         if self.law.margin[0] > Settings().min_margin:
-            self.memory = replace(self.memory, plan=plan, since=t)
+            self.memory = replace(self.memory, plan=plan, since=t, x=())
         self._use(t)
 
     def _slow(self, t: float, x: FloatArray) -> None:
