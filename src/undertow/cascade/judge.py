@@ -30,9 +30,10 @@ JUMP, PART = 0.1, 0.5
 #: left is no motion.
 UNEXPLAINED, SOONER, STILL = 0.03, 5.0, 1e-3
 
-#: What part of the error of the last prediction, in cost, another plan has to gain where states are
-#: estimated: less is within what predictions are off, and every change of a surface has its price.
-RESOLVED = 0.3
+#: Where the last prediction was off by more than this part of the cost, states being estimated,
+#: another plan has to gain so much of what it was off: less is within the errors of prediction, and
+#: every change of a surface shakes the mechanism.
+DOUBTFUL, RESOLVED = 0.5, 0.3
 
 
 class Judge:
@@ -141,7 +142,7 @@ class Judge:
         self, state: CascadeState, loop: ClosedLoop, cost: float, x: FloatArray,
         there: FloatArray | None, span: float,
     ) -> str:  # fmt: skip
-        """Say so where a plan gains less than ``RESOLVED`` of the last prediction's error, in cost.
+        """Say so where a plan gains little beside what the last prediction was off, in cost.
 
         ``there`` is where the estimate says that x would be by now; ``None``: nobody doubts it.
         """
@@ -150,7 +151,8 @@ class Judge:
         old, starts = state.plan, np.array([there, x])
         foreseen, now = loop.batch(starts, [old, old], duration=span, precise=True).score(span)
         off = min(abs(foreseen - now), now)  # a plan that saves much of the cost is always better
-        if max(foreseen, now) >= INADMISSIBLE or now - cost >= RESOLVED * off:
+        resolved = off <= DOUBTFUL * now or now - cost >= RESOLVED * off
+        if max(foreseen, now) >= INADMISSIBLE or resolved:
             return ""
         if math.isfinite(self.breaks(state, [old], x, span)[0][0]):
             return ""
