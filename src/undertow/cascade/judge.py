@@ -31,9 +31,9 @@ JUMP, PART = 0.1, 0.5
 UNEXPLAINED, SOONER, STILL = 0.03, 5.0, 1e-3
 
 #: Where the last prediction was off by more than this part of the cost, states being estimated,
-#: another plan has to gain so much of what it was off: less is within the errors of prediction, and
-#: every change of a surface shakes the mechanism.
-DOUBTFUL, RESOLVED = 0.5, 0.3
+#: another plan has to gain as large a part of what it was off: less is within the errors of
+#: prediction, and every change of a surface shakes the mechanism.
+DOUBTFUL = 0.3
 
 
 class Judge:
@@ -151,7 +151,7 @@ class Judge:
         old, starts = state.plan, np.array([there, x])
         foreseen, now = loop.batch(starts, [old, old], duration=span, precise=True).score(span)
         off = min(abs(foreseen - now), now)  # a plan that saves much of the cost is always better
-        resolved = off <= DOUBTFUL * now or now - cost >= RESOLVED * off
+        resolved = off <= DOUBTFUL * now or now - cost >= DOUBTFUL * off
         if max(foreseen, now) >= INADMISSIBLE or resolved:
             return ""
         if math.isfinite(self.breaks(state, [old], x, span)[0][0]):
