@@ -562,8 +562,9 @@ class Cascade:
         them and one in reserve does, or is survived longer, that one is compared with, and takes
         over unless the proposal does.  A proposal has to suit them all; but where states are exact,
         or for least time with a schedule, it is judged as the plan in use is, both on the estimate.
-        Where states have errors, and the last prediction was off by more than three tenths of the
-        cost, it also has to gain three tenths of that: less is within the errors of prediction.
+        Where states have errors, but for that least time, and the last prediction was off by more
+        than three tenths of the cost, it also has to gain three tenths of that: less is within the
+        errors of prediction.
 
         Where the target moves, what the gate admits is also rolled out along the reference, as is
         the plan in use: constraints have to hold there, and the cost must not rise.

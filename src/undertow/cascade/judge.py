@@ -129,7 +129,7 @@ class Judge:
         return float(off / way) if math.isfinite(off) and way > 0.0 else 0.0
 
     def _expected(self, state: CascadeState, t: float) -> FloatArray | None:
-        """Where the estimate says that the plan in use has brought the state by t.
+        """Where the estimate says that the plan in use has moved the last decision's state by t.
 
         ``None`` along a reference that moves, and where that decision is not known or long past.
         """
