@@ -57,6 +57,9 @@ def test_what_is_invariant_is_found_symbolically() -> None:
     x, phi = crane.q
     for potential, found in ((9.81 * x, ("x",)), (x * sp.sin(phi), ()), (x**2, ())):
         assert invariant_coordinates(replace(crane, potential=potential)) == found
+    turn = 1e6 * (sp.cos(x) ** 2 + sp.sin(x) ** 2)
+    for push, found in ((turn, ("x",)), (turn + 1e-12 * x, ())):  # large terms, little is left
+        assert invariant_coordinates(crane.disturbed({"x": push})) == found
 
 
 def test_masses_that_may_move_together_alone_are_moved_as_the_refusal_says() -> None:

@@ -291,7 +291,11 @@ def test_changed_numbers_make_a_new_mechanism_and_leave_the_old_one() -> None:
     assert heavier.parameter_values[2] == 0.2
     assert heavier.fingerprint != rig.fingerprint
     assert heavier.with_parameters(m=0.125).fingerprint == rig.fingerprint
-    assert rig.with_input_limit(3.0).input_limits == [3.0]
+    weaker = rig.with_input_limit(3.0)
+    assert weaker.input_limits == [3.0]
+    assert weaker.fingerprint != rig.fingerprint
+    assert weaker.structure == rig.structure
+    assert weaker.with_input_limit(15.0).fingerprint == rig.fingerprint
     assert rig.with_disturbance_bounds(0.1, 0.2).disturbance_bounds == (0.1, 0.2)
 
 

@@ -345,13 +345,19 @@ class Mechanism:
             When the mass matrix is not positive definite with them.
         """
         numbers = self._columns("parameter values", values, [p.name for p in self.parameters])
+        copy = self._with(
+            parameters=tuple(
+                with_value(p, float(v)) for p, v in zip(self.parameters, numbers, strict=True)
+            )
+        )
+        check_definite(f"mass_matrix of '{self.name}'", self.coordinates, copy.M)
+        return copy
+
+    def _with(self, **numbers: tuple[Parameter, ...] | tuple[Input, ...]) -> Self:
+        """Return a copy with other numbers, unchecked; what is kept of the equations stays."""
         copy = object.__new__(type(self))
         kept = {k: v for k, v in vars(self).items() if k != "fingerprint"}  # of the structure
-        parameters = tuple(
-            with_value(p, float(v)) for p, v in zip(self.parameters, numbers, strict=True)
-        )
-        copy.__dict__.update(kept, parameters=parameters, structure=self.structure)
-        check_definite(f"mass_matrix of '{self.name}'", self.coordinates, copy.M)
+        copy.__dict__.update(kept, structure=self.structure, **numbers)
         return copy
 
     def with_input_limit(self, *limits: float) -> Self:
@@ -367,7 +373,7 @@ class Mechanism:
             replace(i, limit=number_of(f"limit of input '{i.name}'", v))
             for i, v in zip(self.inputs, limits, strict=True)
         )
-        return replace(self, inputs=inputs)
+        return self._with(inputs=inputs)
 
     def with_disturbance_bounds(self, *bounds: float) -> Self:
         """Return the mechanism with declared bounds |g_i|, one per coordinate (N m or N)."""

@@ -723,7 +723,8 @@ def _composed(op, A, C, V, J):  # type: ignore[no-untyped-def]
             else:
                 for k in range(4 if last else 3):
                     for at in range(2, 4 if op in (SIN, COS) else 3):  # those stand together
-                        _line(J, op if at == 2 else SIN + COS - op, at, k, 0, 5 - at)
+                        # at - at: of a literal 0 numba would compile a version apart
+                        _line(J, op if at == 2 else SIN + COS - op, at, k, at - at, 5 - at)
             for k in range(0 if last else 3):
                 f[k] = middle(J[2, k, 0])
                 d += J[2, k, 0].imag - J[2, k, 0].real

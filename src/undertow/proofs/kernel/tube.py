@@ -304,6 +304,7 @@ class Tube:
     def move(self, rest: Intervals, centre: Intervals, around: Intervals, h: complex) -> bool:
         """Replace the set by what a step makes of it, if that is bounded (Lemma 6)."""
         m, C = self.m.copy(), self.C.copy()
+        rest = np.ascontiguousarray(rest)  # one layout, compiled once
         added = ops.taylor_step(rest, centre, around, h, m, C, self.xi)
         if not np.isfinite(added).all():
             return False
