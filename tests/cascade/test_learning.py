@@ -467,7 +467,7 @@ def test_on_a_bench_a_plan_gives_way_only_to_what_predictions_can_tell_from_it(
     pendulum: ut.Mechanism,
 ) -> None:
     """Where the cost was mispredicted by much, less than three tenths of that is not taken."""
-    objective, x = objective_for(pendulum), pendulum.state(phi=0.3)
+    objective, x = objective_for(pendulum, "bench-energy"), pendulum.state(phi=0.3)
     belief, t = ut.Belief.relative(pendulum, **SPREAD), 0.1
     bench = ut.Cascade(pendulum, objective, belief=belief, covariance=1e-8 * np.eye(4))
     exact = ut.Cascade(pendulum, objective, belief=belief)

@@ -17,7 +17,6 @@ from undertow.closed_loop.gate import cost_gate
 from undertow.closed_loop.work_array import LANES
 from undertow.law import SlidingModeLaw
 from undertow.models import FloatArray
-from undertow.objective import objective_for
 
 HORIZON = 20.0
 
@@ -38,7 +37,7 @@ def plants(rig: ut.Mechanism) -> list[ut.Mechanism]:
 def loop(rig: ut.Mechanism, plants: list[ut.Mechanism]) -> ut.ClosedLoop:
     """The law of the nominal plant on all of them."""
     values = np.array([plant.parameter_values for plant in plants])
-    goal = objective_for(rig, "bench-energy", horizon=HORIZON)
+    goal = ut.MinimumEnergy(horizon=HORIZON)
     return ut.ClosedLoop(rig, goal, ensemble=Ensemble(rig, values))
 
 

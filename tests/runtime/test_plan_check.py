@@ -194,7 +194,7 @@ def test_an_old_answer_is_refused_under_a_new_number(controller: Controller) -> 
 
     worker = FaultyWorker(RECIPE.respond, again, 0.0)
     runtime = Runtime(controller, RECIPE.make_rig(), worker, clock=SimulatedClock())
-    report = runtime.run(0.8)
+    report = runtime.run(0.3)
     said = [text for _, kind, text in report.events if kind == "answer"]
     assert "applied" in said[0]
     assert all("its plan is of another time" in text for text in said[1:])
