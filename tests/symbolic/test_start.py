@@ -31,6 +31,7 @@ PACKAGE = Path(ut.__file__).parent
 def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A cache folder of one's own, and nothing in memory."""
     monkeypatch.setenv("UNDERTOW_CACHE", str(tmp_path))
+    monkeypatch.setattr("undertow.models.mechanism._derived", lagrange.derived)
     kernel.compile_loop.cache_clear()
     yield tmp_path
     kernel.compile_loop.cache_clear()

@@ -78,6 +78,9 @@ __all__ = [
 #: Stands for the identity of the right size until ``__post_init__`` knows m.
 _IDENTITY = cast(sp.ImmutableDenseMatrix, None)
 
+#: Equations of energies: a mechanism is often made again, with other numbers.
+_derived = lru_cache(maxsize=64)(derived)
+
 
 @dataclass(frozen=True, eq=False)
 class Mechanism:
@@ -302,8 +305,8 @@ class Mechanism:
         T, V, D = energies(
             name, coordinates, inputs, rest.get("parameters", ()), kinetic, potential, dissipation
         )
-        q, qd = [c.symbol for c in coordinates], [c.velocity for c in coordinates]
-        mass, force = derived(name, q, qd, T, V, D)
+        q, qd = zip(*((c.symbol, c.velocity) for c in coordinates), strict=True)
+        mass, force = _derived(name, q, qd, T, V, D)
         return cls(name, tuple(coordinates), tuple(inputs), mass, force, potential=V, **rest)
 
     def with_parameters(self, /, **values: float) -> Self:
