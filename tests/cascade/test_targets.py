@@ -218,8 +218,10 @@ def test_a_refusal_tells_what_the_plan_in_use_costs_along_the_reference(
     rig: ut.Mechanism, quick: ut.Surface
 ) -> None:
     """Not what the gate says of it about the target at rest."""
-    gate = lambda *_: Admission(False, "no", 1.0)  # noqa: E731
-    cascade = ut.Cascade(rig, ut.MinimumTime(), belief="exact", gate=gate)
+    cascade = ut.Cascade(
+        rig, ut.objective_for(rig, "effort"), belief="exact",
+        gate=lambda *_: Admission(False, "no", 1.0),
+    )  # fmt: skip
     target = ut.Reference.sine(0.5, theta=0.3).legs(rig, 4.0)[0][1]
     state, x = CascadeState(ut.Plan.of(quick), target=target), rig.state(phi=0.2)
     unstable = ut.Plan.of(replace(quick, lambda_u=-quick.lambda_u))
