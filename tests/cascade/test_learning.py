@@ -463,6 +463,35 @@ def test_what_is_best_for_the_estimate_is_in_use_while_it_can_be_mended(
         assert motion.reached[0] == (not mendable)
 
 
+def test_on_a_bench_a_plan_that_can_wait_gives_way_to_none_that_costs_much_more(
+    pendulum: ut.Mechanism,
+) -> None:
+    """It is late on some plausible plant, and the estimate pays for what is not: only in need."""
+    objective, x = ut.MinimumEnergy(horizon=10.0), pendulum.state(phi=0.3)
+    belief = ut.Belief.relative(pendulum, **SPREAD)
+    made = ut.Cascade(pendulum, objective, belief=belief, covariance=1e-8 * np.eye(4))
+    exact = ut.ClosedLoop(pendulum, objective)
+    hurried = made.loop.batch(x, list(made.reserve))
+    soonest = float(hurried.time[hurried.reached].min())
+    quick = made.reserve[int(np.argmin(np.where(hurried.reached, hurried.time, np.inf)))]
+    assert made.known is not None
+    for horizon, waits in ((6.0, True), (1.1 * soonest, False)):
+        plan = ut.Optimiser(exact).propose(x, horizon=horizon).plan
+        assert plan is not None
+        left = 1.001 * float(exact.batch(x, plan).time[0])
+        late, suited = made.loop.batch(x, [plan, quick], duration=left).reached
+        assert suited
+        assert not late
+        cost, much = exact.batch(x, [plan, quick]).cost
+        assert much > 1.5 * cost
+        memory = CascadeState(plan, x=tuple(x.tolist()), estimate=made.known.prior)
+        proposal = ut.Proposal(quick, "converged", much, math.inf, (), 1, 0.0, 1, 0.0)
+        after, admission = made.apply_gate(memory, proposal, x, left)
+        assert (after.plan == plan) == waits
+        assert admission.accepted == (not waits)
+        assert after.predicted == pytest.approx(cost if waits else hurried.cost.min(), rel=0.01)
+
+
 def test_on_a_bench_a_plan_gives_way_only_to_what_predictions_can_tell_from_it(
     pendulum: ut.Mechanism,
 ) -> None:

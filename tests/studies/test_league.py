@@ -17,14 +17,18 @@ from undertow.base import ArtefactError, InvalidInputError, as_text
 from undertow.cli import app
 from undertow.mechanisms import LIBRARY
 from undertow.models import linearise
-from undertow.plants import RealisticRig
+from undertow.objective import objective_for
+from undertow.plants import Encoder, RealisticRig
+from undertow.plants.bench import bench_for
+from undertow.runtime import estimator_for
 from undertow.studies.campaign import Campaign, Definition, compute, dataset, executor_for
 from undertow.studies.campaign.definition import Settings
-from undertow.studies.campaign.entrants import FAULTS, ForfeitError, Refereed
+from undertow.studies.campaign.entrants import FAULTS, ForfeitError, Refereed, steered
 from undertow.studies.campaign.league import TASKS, League, home
 from undertow.studies.campaign.league_report import median_interval, tables, wilson
 from undertow.studies.campaign.report import alone
 from undertow.studies.campaign.run import study_of
+from undertow.studies.trials.steering import CascadeSteering
 
 pytest.importorskip("zarr")
 pytest.importorskip("casadi")
@@ -318,6 +322,25 @@ def test_a_referee_names_what_was_wrong() -> None:
 
     with pytest.raises(ForfeitError, match="late"):
         Refereed(Late(), np.zeros(4), 1)(0.0, np.zeros(4))
+
+
+def test_our_entrants_are_made_for_the_estimator_that_they_hear() -> None:
+    """Coarse encoders leave more of the input to noise: other gains, another gate."""
+    rig = LIBRARY[RIG]()
+    objective, usual = objective_for(rig), bench_for(rig)
+    coarse = replace(usual, encoders={c.name: Encoder(0.006, noise=0.006) for c in rig.coordinates})
+    noises = []
+    for bench in (usual, coarse):
+        entrant, estimator = steered(rig, objective), estimator_for(rig, bench)
+        entrant.reset(rig.usual_start)
+        entrant.listen(estimator)
+        steering = entrant._feedback
+        assert isinstance(steering, CascadeSteering)
+        noise = steering.cascade.covariance
+        assert noise is not None
+        assert np.array_equal(noise, estimator.noise_covariance())
+        noises.append(noise[2, 2])
+    assert noises[1] > 2 * noises[0]
 
 
 def test_wrong_entries_are_refused_before_any_work(file: Path) -> None:

@@ -421,6 +421,27 @@ def test_a_ledger_goes_on_where_it_ended(tmp_path: Path) -> None:
         Ledger(path, line, {"angle": 0.6})
 
 
+def test_what_a_push_costs_is_counted_where_the_target_was_reached_before(
+    arm: ut.Mechanism,
+) -> None:
+    """It begins at the target, and costs nothing until it is pushed off."""
+    still = Bench(arm)
+    pushed = replace(still, pushes=(Push(0.05, "phi", 0.005),))
+    objective, keeps = ut.MinimumEnergy(), keeping(arm, ut.first_surface(arm))
+    runs = [
+        trial(arm, bench, keeps, np.zeros(4), 1.0, 0, objective=objective)
+        for bench in (still, pushed)
+    ]
+    assert runs[0].cost == 0.0
+    record = runs[1].record
+    voltage = record.u[:, 0] * (record.t > 0.05)
+    at_home = np.linalg.norm(record.truth, axis=1) <= objective.terminal_radius
+    back = np.append(np.flatnonzero(at_home & (record.t > 0.06)), len(record.t))[0]
+    effort = float((voltage[:back] ** 2).sum() * 0.001)
+    assert effort > 0.01
+    assert runs[1].cost == pytest.approx(effort, rel=0.1)
+
+
 def test_the_observed_disturbance_frees_an_arm_that_stiction_holds(arm: ut.Mechanism) -> None:
     """A soft surface and twice the friction: stuck far from home without, at home with it."""
     soft = ut.Surface(alpha_a=-1, lambda_a=-0.32, alpha_u=2.5, lambda_u=15)

@@ -564,7 +564,9 @@ class Cascade:
         or for least time with a schedule, it is judged as the plan in use is, both on the estimate.
         Where states have errors, but for that least time, and the last prediction was off by more
         than three tenths of the cost, it also has to gain three tenths of that: less is within the
-        errors of prediction.
+        errors of prediction.  And a plan in use that some plausible plant does not bear to the end,
+        but that can be left for one in reserve a period later, gives way to none that costs the
+        estimate a tenth more.
 
         Where the target moves, what the gate admits is also rolled out along the reference, as is
         the plan in use: constraints have to hold there, and the cost must not rise.

@@ -35,6 +35,10 @@ UNEXPLAINED, SOONER, STILL = 0.03, 5.0, 1e-3
 #: prediction, and every change of a surface shakes the mechanism.
 DOUBTFUL = 0.3
 
+#: How much more a plan may cost the estimate, as a factor, that takes over from one which does not
+#: suit every plausible plant, and can be left a period later: by then more is known of the plant.
+PATIENT = 1.1
+
 
 class Judge:
     """Decides on plans, with a cascade's gate and what every plausible plant asks for.
@@ -158,6 +162,22 @@ class Judge:
             return ""
         return f"gains {now - cost:.3g}, when the last prediction was {off:.3g} off"
 
+    def _in_haste(
+        self, state: CascadeState, loop: ClosedLoop, old: Plan, new: Plan, error: FloatArray,
+        span: float, soon: float,
+    ) -> str:  # fmt: skip
+        """Say so where a plan that suits all costs much more than one that can wait for it."""
+        if self.recourse or loop.ensemble is None:
+            return ""
+        if loop.batch(error, old, duration=span).score(span)[0] < INADMISSIBLE:
+            return ""
+        estimated = self.predictions.estimated_at(state)
+        motions = estimated.batch(error, [old, new], duration=span, precise=True)
+        cost, found = motions.score(span)
+        if found <= PATIENT * cost or not self._can_wait(state, loop, old, error, soon):
+            return ""
+        return f"costs the estimate {found:.3g}, not {cost:.3g}, and the plan in use can wait"
+
     def _frees_too_late(self, state: CascadeState, loop: ClosedLoop, new: Plan) -> str:
         """Say so where a joint sticks farther off with a new plan than with the one in use."""
         off = self._sticks(state, loop, new)
@@ -251,6 +271,7 @@ class Judge:
             doubted = there if old is used else None
             words = (
                 self._gains_little(state, judge, admission.cost, error, doubted, span)
+                or self._in_haste(state, loop, old, proposal.plan, error, span, soon)
                 or self._frees_too_late(state, loop, proposal.plan)
                 or self._breaks_sooner(state, proposal.plan, error, span)
             )

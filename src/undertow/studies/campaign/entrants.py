@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, Protocol
 
@@ -13,12 +13,13 @@ import numpy as np
 
 from undertow.base import InvalidInputError, a_kind, error_text
 from undertow.cascade import Cascade
-from undertow.estimators import Estimator
+from undertow.estimators import Belief, Estimator, StateFeedback
 from undertow.law import first_surface
 from undertow.models import FloatArray, Mechanism
 from undertow.models.importers.python_file import in_a_file, named_in_file
 from undertow.objective import Objective
 from undertow.plants.bench import bench_for
+from undertow.runtime import estimator_for
 from undertow.studies.trials.steering import (
     cascade_and_kept,
     clipped_regulator,
@@ -131,20 +132,63 @@ class Feedback:
         return self._feedback(t, x)
 
 
+@dataclass(frozen=True)
+class _Told:
+    """An estimator, which is like another one where its noise is."""
+
+    noise: bytes
+    estimator: Estimator = field(compare=False)
+
+
 @lru_cache(maxsize=4)
-def _optimised(mechanism: Mechanism, objective: Objective) -> tuple[MakeController, MakeController]:
-    cascade, bench = Cascade(mechanism, objective), bench_for(mechanism)
-    return cascade_and_kept(cascade, bench, mechanism.usual_start)
+def _optimised(
+    mechanism: Mechanism, objective: Objective, told: _Told
+) -> tuple[MakeController, MakeController]:
+    cascade = Cascade(mechanism, objective)
+    return cascade_and_kept(cascade, told.estimator, mechanism.usual_start)
 
 
-def steered(mechanism: Mechanism, objective: Objective) -> Feedback:
-    """Return the cascade as ``undertow run`` makes it for the usual bench."""
-    return Feedback(_optimised(mechanism, objective)[0])
+class Optimised:
+    """The cascade as ``undertow run`` makes it for its estimator, or its first optimum kept.
+
+    Where none is handed over, that is the estimator of the usual bench.
+    """
+
+    def __init__(self, mechanism: Mechanism, objective: Objective, *, kept: bool) -> None:
+        self.mechanism, self.objective, self.kept = mechanism, objective, kept
+
+    def reset(self, x0: FloatArray) -> None:
+        """Begin a run."""
+        self._x0 = x0
+        self._feedback: StateFeedback | None = None
+
+    def listen(self, estimator: Estimator) -> None:
+        """Hand the estimator over."""
+        self._feedback = self._made_for(estimator)
+        introduce(self._feedback, estimator)
+
+    def step(self, t: float, x: FloatArray) -> FloatArray:
+        """Return the input at (t, x)."""
+        if self._feedback is None:
+            mechanism = self.mechanism
+            known = Belief.usual(mechanism)
+            usual = estimator_for(mechanism, bench_for(mechanism), known=known)
+            self._feedback = self._made_for(usual)
+        return self._feedback(t, x)
+
+    def _made_for(self, estimator: Estimator) -> StateFeedback:
+        told = _Told(estimator.noise_covariance().tobytes(), estimator)
+        return _optimised(self.mechanism, self.objective, told)[self.kept](self._x0)
 
 
-def kept(mechanism: Mechanism, objective: Objective) -> Feedback:
+def steered(mechanism: Mechanism, objective: Objective) -> Optimised:
+    """Return the cascade as ``undertow run`` makes it."""
+    return Optimised(mechanism, objective, kept=False)
+
+
+def kept(mechanism: Mechanism, objective: Objective) -> Optimised:
     """Return the cascade's first optimum, kept."""
-    return Feedback(_optimised(mechanism, objective)[1])
+    return Optimised(mechanism, objective, kept=True)
 
 
 def designed(mechanism: Mechanism, objective: Objective) -> Feedback:

@@ -41,7 +41,7 @@ from undertow.studies.campaign.study import Arrays, Axis, Study, Variable, toler
 from undertow.studies.trials.trial import Outcome, trial
 
 #: Of the definition of tasks and scores: a change of either makes it another one.
-VERSION = 1
+VERSION = 2
 
 #: The tasks: see :meth:`League.bench`.
 TASKS = ("exact", "plants", "friction", "delay", "noise", "push", "bench")
@@ -71,8 +71,9 @@ class League(Study):
     Every run begins at the mechanism's usual start.  All entrants have the same estimator, which
     knows the usual bench and the encoders of the run; what it knows of a disturbance at the inputs
     is taken off the output of each.  A run is won when everything is home for its last second, see
-    :func:`home`.  The cost is that of the objective, along the true motion; entrant ``bound`` is
-    what the plant itself allows with hindsight, without friction, noise, delay or push.
+    :func:`home`.  The cost is that of the objective, along the true motion, until the terminal set
+    is reached: after the push, where there is one.  Entrant ``bound`` is what the plant itself
+    allows with hindsight, without friction, noise, delay or push.
 
     Settings: ``mechanisms``, names, by default the one of the campaign; ``tasks`` and ``entrants``,
     lists, by default all; ``plants`` of each task; ``objective``, by default ``effort``;

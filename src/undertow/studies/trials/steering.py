@@ -137,19 +137,21 @@ class CascadeSteering:
 
 
 def cascade_and_kept(
-    cascade: Cascade, bench: Bench, x0: FloatArray
+    cascade: Cascade, told: Bench | Estimator, x0: FloatArray
 ) -> tuple[MakeController, MakeController]:
     """Return the makers of the cascade and of its first optimum, kept: one search from x0, (2n,).
 
-    Both are as :func:`undertow.runtime.for_rig` makes them for what is told of the bench.
+    Both are as :func:`undertow.runtime.for_rig` makes them for an estimator: the one that is
+    ``told``, or that of what is told of the bench.
 
     Raises
     ------
     InfeasibleError
         When the first optimisation finds no admissible surface.
     """
-    known = estimator_for(cascade.mechanism, bench, known=cascade.known)
-    suited = for_rig(cascade, known)
+    if isinstance(told, Bench):
+        told = estimator_for(cascade.mechanism, told, known=cascade.known)
+    suited = for_rig(cascade, told)
     state, proposal = suited.start(x0)
     start = suited.prepared(state, x0), proposal
     kept = keeping(suited.mechanism, start[0].plan, suited.reaching)

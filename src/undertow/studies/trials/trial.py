@@ -108,7 +108,8 @@ def trial(
         estimator = estimator_for(belief, told or bench, known=Belief.usual(belief))
     rig = RealisticRig(bench, x0, seed)
     record = run_trial(belief, rig, estimator, make, seconds, compensates)
-    return judge(belief, record, seed, objective, home)
+    pushed = max((push.t for push in bench.pushes), default=-math.inf)
+    return judge(belief, record, seed, objective, home, pushed)
 
 
 def run_trial(
@@ -134,8 +135,12 @@ def judge(
     seed: int = 0,
     objective: Objective | None = None,
     home: ArrayLike | None = None,
+    pushed: float = -math.inf,
 ) -> Outcome:
-    """Return what came of a recorded run; ``home``, (n,), is how near the target that is."""
+    """Return what came of a recorded run; ``home``, (n,), is how near the target that is.
+
+    The cost is until the terminal set is reached: after the last push, at the time ``pushed``, s.
+    """
     driven = np.arange(mechanism.n) < mechanism.m
     near = np.where(driven, HOME_DRIVEN, HOME_FREE) if home is None else np.asarray(home)
     settled = _settled(record, near)
@@ -149,7 +154,7 @@ def judge(
         caught=caught,
         approaching=caught and bool(((now <= near) | (now < before)).all()),
         settled=settled,
-        cost=math.nan if objective is None else _cost(mechanism, objective, record),
+        cost=math.nan if objective is None else _cost(mechanism, objective, record, pushed),
         effort=record.effort,
         chatter=record.chatter / float(record.t[-1]),
         record=record,
@@ -169,10 +174,10 @@ def _settled(record: Record, home: FloatArray) -> float:
     return float(record.t[np.flatnonzero(away)[-1] + 1]) if away.any() else 0.0
 
 
-def _cost(mechanism: Mechanism, objective: Objective, record: Record) -> float:
-    """Integrate the stage cost from sample to sample, until the terminal set is reached."""
+def _cost(mechanism: Mechanism, objective: Objective, record: Record, pushed: float) -> float:
+    """Integrate the stage cost, from sample to sample, until the terminal set is reached."""
     radius = np.linalg.norm(record.truth, axis=1)
-    inside = np.flatnonzero(radius <= objective.terminal_radius)
+    inside = np.flatnonzero((radius <= objective.terminal_radius) & (record.t > pushed))
     end = int(inside[0]) if len(inside) else len(record.t)
     if end == 0:
         return 0.0
