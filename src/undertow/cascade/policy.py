@@ -153,6 +153,7 @@ class _CascadeEpisode:
         cascade, t = self._cascade, self._k * self._period
         if self._memory is None:
             self._memory, _ = cascade.start(x)
+            self._planned_with = self._memory.estimate
         elif self._k % self._learns == 0 or self._k % self._decides == 0:
             self._memory = self._learnt(self._memory)
             due = self._k % self._decides == 0
@@ -231,7 +232,9 @@ def policy(
         what = f"limit of input '{given.name}' of '{mechanism.name}'"
         remedy = f"Give it an Input({given.name!r}, limit=…): an action of 1 is the whole input"
         positive(what, given.limit, remedy)
-    controller.reaching.check_period("period of a policy", period, mechanism.m)
+    plan = None if surfaces is None else Plan.of(surfaces)
+    for law in [controller.reaching] if plan is None else plan.laws(controller.reaching):
+        law.check_period("period of a policy", period, mechanism.m)
     if cascade is not None:
         count = cascade.period / period
         if abs(count - round(count)) > 1e-6:
@@ -243,6 +246,6 @@ def policy(
             )
         return Policy(mechanism, partial(_CascadeEpisode, cascade, period), period)
     assert isinstance(controller, ClosedLoop)  # no cascade
-    assert surfaces is not None  # no cascade
-    begin = partial(_PlanEpisode, controller, Plan.of(surfaces), period)
+    assert plan is not None  # no cascade
+    begin = partial(_PlanEpisode, controller, plan, period)
     return Policy(mechanism, begin, period)
