@@ -14,7 +14,7 @@ import numpy as np
 from undertow.base import InvalidInputError, UndertowError, a_kind, check_fields, one_of, positive
 from undertow.cascade import Cascade, CascadeState, Legs, derate_actuator
 from undertow.cascade.swing_up import CatchRegion, SwingUpAndCatch, designed, hanging
-from undertow.estimators import Estimator, MakeEstimator
+from undertow.estimators import Belief, Estimator, MakeEstimator
 from undertow.law import Plan, Reference, ReferenceMotion, SetPoints
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import named
@@ -177,9 +177,10 @@ class Recipe:
 
     @cached_property
     def belief(self) -> Mechanism:
-        """The controller's model."""
+        """The controller's model, its inputs limited as the settings have it."""
         known = named(self.mechanism) if isinstance(self.mechanism, str) else self.mechanism
-        return known.with_parameters(**self.parameters)
+        known, limits = known.with_parameters(**self.parameters), self.settings.limits(known)
+        return known.with_input_limit(*limits) if (limits < known.input_limits).any() else known
 
     def in_names(self) -> Self | None:
         """Return the same recipe with names in place of objects; None where they have none."""
@@ -239,8 +240,14 @@ class Recipe:
     @cached_property
     def _designed(self) -> Cascade:
         """The cascade as it is for exact states."""
-        if self.design is not None:
-            return self.design
+        design = self.design
+        if design is not None:
+            if (design.mechanism.input_limits == self.belief.input_limits).all():
+                return design
+            about = design.belief
+            if isinstance(about, Belief):
+                about = replace(about, mechanism=self.belief)
+            return replace(design, mechanism=self.belief, belief=about)
         goal = self.objective
         if not isinstance(goal, Objective):
             goal = objective_for(self.belief, goal, horizon=self.horizon)
