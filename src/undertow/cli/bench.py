@@ -83,6 +83,7 @@ def bench(
             remedy="Leave --quick out",
         )
     request = {"mechanism": name, "rig": rig, "fault": fault or [], "seed": seed}
+    request |= {"setting": setting or [], "delay": delay, "quick": quick}
     belief = mechanism_named(name, setting)
     rest, faults = rest_state(belief), fault or ()
     check_out(out)
