@@ -296,6 +296,9 @@ def _local(case: _Case) -> Verdict | str:
     batch = case.loop.batch(case.x, case.plan, duration=case.horizon)
     if not batch.reached.all():
         return f"the predicted motion ends: {_event(batch)}"
+    margins = _Margins(case.policy)
+    if broken := margins.broken(case.loop, batch.singular, batch.path, batch.input):
+        return broken
     return Verdict(
         "the predicted motion reaches the target, where the closed loop is stable",
         "sampled",
