@@ -203,6 +203,8 @@ def compare(
         named = _numbered([(_name(item), item) for item in named])
     for controller in named.values():
         _check_maker(controller)
+        if isinstance(controller, Cascade):
+            mechanism.check_plant(controller.mechanism)
     meets: Mapping[str, Bench | Mechanism]
     if isinstance(plants, Mapping):
         meets = plants
