@@ -82,7 +82,8 @@ class Cascade:
         Reaching law of the inner loop; by default :func:`undertow.law.usual_reaching`: the paper's,
         its boundary layer as thick as the mechanism's disturbance bounds ask for.
     period
-        Δt between re-optimisations, s.
+        Δt between re-optimisations, s; of a run on a rig the lead time where no settings say
+        another, see :func:`undertow.run`.
     first
         First surface, checked; designed by itself by default.
     step, zoh_steps
