@@ -195,6 +195,14 @@ def test_after_a_knock_a_plan_in_reserve_takes_over_and_a_decision_comes_early()
     assert controller.mode in (Mode.CATCH, Mode.BALANCE)
 
 
+@pytest.mark.parametrize(("asked", "kept"), [(0.5, 0.5), (1.5, math.radians(60.0))])
+def test_with_a_swing_up_the_smaller_angle_has_fallen(asked: float, kept: float) -> None:
+    """That of the settings was passed over."""
+    recipe = replace(SWINGING, settings=Settings(fall_angle=asked))
+    controller = recipe.make_controller(SWINGING.first())
+    assert controller._fall_angle == pytest.approx(kept)
+
+
 @pytest.mark.slow
 def test_thrown_out_it_swings_up_again_within_limits() -> None:
     """Knocked over while it balances: safe outputs throughout, and back to the top."""

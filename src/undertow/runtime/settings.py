@@ -53,7 +53,8 @@ class Settings:
         Largest |q_i|, rad or m, besides the ranges of the coordinates: where a run is stopped.
         Plans keep to the ranges alone.
     fall_angle
-        A free angle further than this from the target has fallen, rad.
+        A free angle further than this from the target has fallen, rad; with a swing-up one further
+        than 60° in any case.
     max_state_norm
         ‖x‖₂ beyond which the motion has escaped, whatever the predictions' own limit.
     max_step_interval
