@@ -221,6 +221,8 @@ def test_version_and_bare_call() -> None:
         (("export", "c", RIG, "--check", "--objective", "speed"), "'speed'", "bench-time"),
         (("export", "c", RIG, "--check", "--objective", "time"), "time", "--control one-time"),
         (("export", "c", RIG, "--check", "--start", "psi=1deg"), "'psi'", "theta, phi"),
+        (("export", "c", RIG, "--check", "--start", "phi=1deg"), "phi=1deg", "one-time"),
+        (("export", "c", RIG, "--check", "--states", "9"), "9, without a report", "--report"),
         (("export", "c", RIG, "--check", "--velocity", "slow"), "'slow'", "derivative, super"),
         (
             ("export", "c", RIG, "--check", "--velocity", "kalman", "--time-constant", "0.1"),
