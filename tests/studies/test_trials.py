@@ -82,6 +82,16 @@ def test_predictive_control_for_a_cost_that_no_input_raises_is_refused(
         ut.nmpc(arm, objective)
 
 
+def test_predictive_control_is_not_asked_for_constraints_that_it_does_not_keep(
+    arm: ut.Mechanism,
+) -> None:
+    bounded = ut.MinimumEnergy(constraints=ut.state_box(theta=0.5))
+    with pytest.raises(
+        InvalidInputError, match=r"constraints of an objective for NMPC: got .*theta"
+    ):
+        ut.nmpc(arm, bounded)
+
+
 @pytest.mark.slow
 def test_on_the_ideal_rig_the_cascade_costs_no_more_than_its_start(arm: ut.Mechanism) -> None:
     """Lemma 3 in the loop: re-optimised a period behind, still never worse than one-time."""
