@@ -68,6 +68,16 @@ def test_a_cascade_as_a_policy_decides_learns_and_balances(belief: Any) -> None:
     assert cost < 1.1 * run.cost
 
 
+def test_a_cascade_as_a_policy_arrives_within_the_horizon() -> None:
+    """Its end receded from decision to decision, and with it the arrival, for a smooth cost."""
+    pytest.importorskip("gymnasium")
+    goal = replace(GOAL, horizon=1.5)
+    cascade = ut.Cascade(RIG, goal, belief="exact", cold=ut.Budget(400), warm=ut.Budget(64))
+    time, _, event = play(ut.policy(cascade), ut.environment(RIG, goal), phi=0.2)
+    assert event == "REACHED"
+    assert time <= 1.5
+
+
 def test_a_policy_that_is_as_slow_as_decisions_decides_at_each_step() -> None:
     asked: list[float] = []
     cascade = ut.Cascade(

@@ -135,7 +135,8 @@ class _CascadeEpisode:
     """The cascade: decisions fall in the periods in which they are due, and take no time.
 
     As in :meth:`undertow.Cascade.simulate` what moves is learnt some times between two of them, and
-    what is learnt may call for another one.
+    what is learnt may call for another one; and the task is to be done within the horizon of the
+    objective, from the beginning of the episode or from when it was last at the target.
     """
 
     def __init__(self, cascade: Cascade, period: float) -> None:
@@ -144,7 +145,7 @@ class _CascadeEpisode:
         self._planned_with: ParameterEstimate | None = None
         self._x: list[FloatArray] = []
         self._u: list[FloatArray] = []
-        self._k = 0
+        self._k, self._since = 0, 0.0
         self._decides, self._learns = (
             max(1, round(span / period)) for span in (cascade.period, LEARNING)
         )
@@ -159,14 +160,24 @@ class _CascadeEpisode:
             due = self._k % self._decides == 0
             due = due or is_news(self._planned_with, self._memory.estimate)
             if due or not cascade.survives(self._memory, x, t):
-                proposal = cascade.propose(self._memory, x, t)
-                self._memory, _ = cascade.apply_gate(self._memory, proposal, x)
+                left = self._left(x, t)
+                proposal = cascade.propose(self._memory, x, t, left)
+                self._memory, _ = cascade.apply_gate(self._memory, proposal, x, left)
                 self._planned_with = self._memory.estimate
         u = cascade.control(self._memory, t, x).u
         self._x.append(x)
         self._u.append(u)
         self._k += 1
         return u
+
+    def _left(self, x: FloatArray, t: float) -> float:
+        """Return the time that is left for the task, s: where it is over another one begins."""
+        objective = self._cascade.objective
+        left = objective.horizon - (t - self._since)
+        if np.linalg.norm(x) > objective.terminal_radius and left > 0.5 * self._cascade.step:
+            return left
+        self._since = t
+        return objective.horizon
 
     def _learnt(self, memory: CascadeState) -> CascadeState:
         """Return the memory with what the motion since the last time shows of the plant.
