@@ -318,6 +318,7 @@ class Cascade:
         error = state.error(state.since, self.mechanism.check_state(x))
         known = state.estimate
         loop = self.predictions.single(known) or self.predictions.plausible(known)
+        loop = self.about(loop, state.target, state.since)  # whose travel is not counted from it
         return replace(state, after_jump=self._reserve.after_jump(loop, state.plan, error))
 
     @checked
