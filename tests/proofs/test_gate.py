@@ -257,6 +257,8 @@ def test_sets_that_were_proved_before_are_used() -> None:
     plan = Plan((GOOD,), (0.0,), (faster,))
     assert assess(LOOP, plan, FAR, 20.0, only, [here]).kind == "undecided"
     assert assess(LOOP, plan, FAR, 20.0, only, [replace(here, reaching=faster)]).kind == "proved"
+    same = Plan((GOOD,), (0.0,), (ut.ReachingLaw((20.0,), (0.1,)),))  # as an optimiser writes it
+    assert assess(LOOP, same, FAR, 20.0, only, [here]).kind == "proved"
 
 
 def test_a_schedule_is_judged_by_its_last_surface() -> None:
