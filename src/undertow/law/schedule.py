@@ -155,6 +155,7 @@ class Plan:
         """Surface vectors, (S, 2mn)."""
         return np.stack([surface.vector for surface in self.surfaces])
 
+    @checked
     def laws(self, otherwise: ReachingLaw) -> tuple[ReachingLaw, ...]:
         """Return the reaching law of each surface, ``otherwise`` where none is given.
 
