@@ -224,6 +224,21 @@ def test_plans_are_made_with_the_output_that_the_settings_leave(designed: bool) 
     assert whole.cascade.loop.input_limits == [15.0]
 
 
+def test_a_limit_of_the_output_leaves_the_objective_as_it_is() -> None:
+    """What an input costs, as a part of the mechanism's own limit; and a log can still name it."""
+    rig = ut.mechanisms.rotary_pendulum()
+    cascade = ut.Cascade(rig)
+    recipe = Recipe(
+        rig, objective=cascade.objective, horizon=60.0, design=cascade,
+        settings=Settings(output_limit=5.0),
+    )  # fmt: skip
+    written = recipe.in_names()
+    assert written is not None
+    again = Recipe.from_dict(written.as_dict())
+    assert again.belief.fingerprint == recipe.belief.fingerprint
+    assert again.cascade.objective == recipe.cascade.objective == cascade.objective
+
+
 @pytest.mark.parametrize("period", [0.0, 0.15, float("nan")])
 def test_a_period_that_is_itself_a_stall_is_refused(period: float) -> None:
     with pytest.raises(InvalidInputError, match="period of a run"):

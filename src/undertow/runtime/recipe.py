@@ -178,9 +178,14 @@ class Recipe:
     @cached_property
     def belief(self) -> Mechanism:
         """The controller's model, its inputs limited as the settings have it."""
+        whole, limits = self._whole, self.settings.limits(self._whole)
+        return whole.with_input_limit(*limits) if (limits < whole.input_limits).any() else whole
+
+    @cached_property
+    def _whole(self) -> Mechanism:
+        """The same with the whole of its inputs, which words for an objective are about."""
         known = named(self.mechanism) if isinstance(self.mechanism, str) else self.mechanism
-        known, limits = known.with_parameters(**self.parameters), self.settings.limits(known)
-        return known.with_input_limit(*limits) if (limits < known.input_limits).any() else known
+        return known.with_parameters(**self.parameters)
 
     def in_names(self) -> Self | None:
         """Return the same recipe with names in place of objects; None where they have none."""
@@ -201,7 +206,7 @@ class Recipe:
             known_goals = (
                 word
                 for word in get_args(Goal)
-                if objective_for(made.belief, word, horizon=goal.horizon) == goal.on(belief)
+                if objective_for(made._whole, word, horizon=goal.horizon) == goal.on(belief)
             )
             named_goal = next(known_goals, None)
             if named_goal is None or goal.horizon > FARTHEST:
@@ -250,7 +255,7 @@ class Recipe:
             return replace(design, mechanism=self.belief, belief=about)
         goal = self.objective
         if not isinstance(goal, Objective):
-            goal = objective_for(self.belief, goal, horizon=self.horizon)
+            goal = objective_for(self._whole, goal, horizon=self.horizon)
         known: Literal["usual", "exact"] = "usual" if self.learns else "exact"
         return Cascade(self.belief, goal, seed=self.seed, belief=known)
 
