@@ -265,6 +265,18 @@ def test_the_travel_is_a_constraint_about_a_target_too() -> None:
     assert "1.425 m" in travel.name
 
 
+def test_about_a_target_plausible_plants_have_their_errors_too() -> None:
+    """Small ones of state and surface, which a belief adds: about x = 0 nothing is otherwise."""
+    cart = ut.mechanisms.cart_pendulum()
+    cascade, x = ut.Cascade(cart, ut.objective_for(cart, "effort", horizon=10.0)), cart.usual_start
+    still = ReferenceMotion.at_rest(np.zeros(2))
+    costs = [
+        loop.batch(x, list(cascade.reserve)).cost
+        for loop in (cascade.loop, cascade.about(cascade.loop, still, 0.0))
+    ]
+    assert costs[1] == pytest.approx(costs[0], rel=1e-9)
+
+
 def test_each_target_is_seen_from_itself() -> None:
     """Of two targets in turn each has its own distance to the stops, of one set of formulas."""
     cascade = ut.Cascade(CRANE, ut.MinimumEnergy(horizon=8.0), belief="exact")
