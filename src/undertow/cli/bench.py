@@ -12,7 +12,7 @@ from rich.console import Group
 
 from undertow.base import InvalidInputError
 from undertow.cli import options
-from undertow.cli.parsing import mechanism_named
+from undertow.cli.parsing import mechanism_named, parse_values
 from undertow.cli.terminal import (
     check_out,
     command,
@@ -109,7 +109,7 @@ def bench(
         show(table)
         if found.identification is not None:
             show(Group("", parameter_table(found.identification)))
-        said = handed_on(name, rig, found) if in_a_file(rig) else ()
+        said = handed_on(name, rig, found, parse_values(setting)) if in_a_file(rig) else ()
         show(*summary(found), *said, *written)
         exit_unless(not found.wrong)
 
