@@ -686,6 +686,12 @@ def test_start_outside_the_constraints_or_the_joint_range_is_refused() -> None:
         bound(short, ut.MinimumEnergy(), short.state(theta=2.0))
 
 
+def test_where_the_travel_does_not_count_a_start_may_be_past_it() -> None:
+    cart, far = ut.mechanisms.cart_pendulum(), ut.MinimumEnergy(horizon=4.0, travel=False)
+    found = bound(cart, far, x=1.6, intervals=20)
+    assert found.x[0, 0] == 1.6 > cart.coordinates[0].high
+
+
 def test_guess_of_another_mechanism_is_refused() -> None:
     """A recorded motion with another number of states is refused before any solve."""
     rig = pendulum()

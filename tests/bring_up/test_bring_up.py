@@ -607,6 +607,11 @@ def test_what_was_identified_is_handed_on_to_a_run() -> None:
     words = "undertow run 'my arm.py:arm' --rig d.py:D --set a_e=0.13236 --delay 0.0035"
     assert command == f"Run it with what was found: {words}"
     assert gain == "voltage comes out 0.9 times: divide by that in the driver"
+    given = {"a_e": 0.2, "m": 0.13}  # what was not identified stays as it was given
+    command, _ = handed_on("arm.py:arm", "d.py:D", BringUp((), None, identified, None), given)
+    assert "--set a_e=0.13236" in command
+    assert "--set m=0.13 " in command
+    assert command.count("--set") == 2
     wrong = RigFinding("delay", "the loop", "3.5 ms", "1.5 ms", "wrong")
     assert handed_on("arm.py:arm", "d.py:D", BringUp((wrong,), None, identified, None)) == ()
 

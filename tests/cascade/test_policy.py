@@ -17,6 +17,7 @@ RIG = ut.mechanisms.rotary_pendulum()
 GOAL = ut.objective_for(RIG, "effort", horizon=10.0)
 SURFACE = ut.first_surface(RIG)
 FREE = RIG.with_input_limit(np.inf)
+QUICK = ut.Plan((SURFACE,), reaching=(ut.ReachingLaw(200.0, 0.2),))
 
 
 def play(policy: ut.Policy, env: Any, **start: float) -> tuple[float, float, str]:
@@ -67,6 +68,16 @@ def test_a_cascade_as_a_policy_decides_learns_and_balances(belief: Any) -> None:
     assert cost < 1.1 * run.cost
 
 
+def test_a_cascade_as_a_policy_arrives_within_the_horizon() -> None:
+    """Its end receded from decision to decision, and with it the arrival, for a smooth cost."""
+    pytest.importorskip("gymnasium")
+    goal = replace(GOAL, horizon=1.5)
+    cascade = ut.Cascade(RIG, goal, belief="exact", cold=ut.Budget(400), warm=ut.Budget(64))
+    time, _, event = play(ut.policy(cascade), ut.environment(RIG, goal), phi=0.2)
+    assert event == "REACHED"
+    assert time <= 1.5
+
+
 def test_a_policy_that_is_as_slow_as_decisions_decides_at_each_step() -> None:
     asked: list[float] = []
     cascade = ut.Cascade(
@@ -100,6 +111,26 @@ def test_a_cascade_as_a_policy_learns_the_plant_that_it_meets() -> None:
     assert learnt == pytest.approx(heavier.substitution[sym("m")], rel=0.02)
 
 
+def test_what_a_policy_learns_calls_for_a_plan_before_the_first_is_due() -> None:
+    """As in simulation: of a plant a quarter heavier the first samples tell enough."""
+    pytest.importorskip("gymnasium")
+    asked: list[float] = []
+    cascade = ut.Cascade(RIG, GOAL, belief=ut.Belief.relative(RIG, m=0.3), cold=ut.Budget(64))
+
+    class Watch:
+        def propose(self, x: FloatArray, /, **rest: Any) -> ut.Proposal:
+            asked.append(rest["computed_for"])
+            return cascade.optimiser.propose(x, **rest)
+
+    env = ut.environment(RIG.with_parameters(m=1.25 * RIG.substitution[sym("m")]), GOAL)
+    act, state = ut.policy(replace(cascade, planner=Watch())), None
+    x, _ = env.reset(options={"phi": 0.3})
+    for _ in range(6):
+        action, state = act.predict(x, state)
+        x = env.step(action)[0]
+    assert asked == pytest.approx([0.0, 0.02])
+
+
 def sym(name: str) -> Any:
     return next(p.symbol for p in RIG.parameters if p.name == name)
 
@@ -127,6 +158,7 @@ def test_stable_baselines3_s_loop_over_a_vector_balances() -> None:
         (lambda: ut.policy(ut.ClosedLoop(RIG)), "surfaces of a policy"),
         (lambda: ut.policy(ut.Cascade(RIG), SURFACE), "surfaces of a policy"),
         (lambda: ut.policy(ut.ClosedLoop(RIG), SURFACE, period=0.01), "below 2 ε/η = 0.01"),
+        (lambda: ut.policy(ut.ClosedLoop(RIG), QUICK), "below 2 ε/η = 0.002"),
         (lambda: ut.policy(ut.Cascade(RIG), period=0.003), "a whole part of the cascade's"),
         (lambda: ut.policy(ut.ClosedLoop(RIG), SURFACE).predict(np.zeros((2, 4)), ()), "episodes"),
         # Its actions, inputs over their limits, were all 0.

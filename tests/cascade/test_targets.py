@@ -14,6 +14,7 @@ from undertow.base import InvalidInputError
 from undertow.cascade import Admission, CascadeState
 from undertow.cascade.simulation import legs_to, moments
 from undertow.closed_loop.along_reference import simulate_along
+from undertow.law import ReferenceMotion
 from undertow.models import FloatArray
 
 CRANE = ut.mechanisms.overhead_crane()
@@ -121,6 +122,23 @@ def test_a_set_point_is_0_seen_from_elsewhere() -> None:
     late = np.array([update.t for update in there.updates]) % cascade.period
     assert (np.minimum(late, cascade.period - late) > 1e-6).any()
     assert {update.task for update in there.updates} == {0}
+
+
+def test_what_takes_over_after_a_jump_keeps_within_the_travel_about_a_target_too() -> None:
+    """It is what a cart with its rail moved by as much has at x = 0: 95 % of ±1.5 m less 1.2 m."""
+    here = ut.mechanisms.cart_pendulum()
+    rail, angle = here.coordinates
+    moved = replace(rail, low=(-1.425 - 1.2) / 0.95, high=(1.425 - 1.2) / 0.95)
+    there = replace(here, coordinates=(moved, angle))
+    chosen = []
+    for cart, x, to in ((here, 0.9, 1.2), (there, -0.3, 0.0)):
+        goal = ut.objective_for(cart, "bench-time", horizon=10.0)
+        cascade = ut.Cascade(cart, goal, belief="exact")
+        begun = CascadeState(ut.Plan.of(cascade.optimiser.anchor))
+        target = ReferenceMotion.at_rest(np.array([to, 0.0])) if to else None
+        state = replace(begun, target=target)
+        chosen.append(cascade.prepared(state, cart.state(x=x, phi=0.1)).after_jump)
+    assert chosen[0] == chosen[1]
 
 
 def test_the_pieces_of_a_run_leave_no_gap() -> None:
@@ -245,6 +263,18 @@ def test_the_travel_is_a_constraint_about_a_target_too() -> None:
     (leg,) = legs_to(cascade, ut.SetPoints({"x": 1.0}), 8.0)
     (travel,) = cascade.about(cascade.loop, leg.target, 0.0).objective.constraints
     assert "1.425 m" in travel.name
+
+
+def test_about_a_target_plausible_plants_have_their_errors_too() -> None:
+    """Small ones of state and surface, which a belief adds: about x = 0 nothing is otherwise."""
+    cart = ut.mechanisms.cart_pendulum()
+    cascade, x = ut.Cascade(cart, ut.objective_for(cart, "effort", horizon=10.0)), cart.usual_start
+    still = ReferenceMotion.at_rest(np.zeros(2))
+    costs = [
+        loop.batch(x, list(cascade.reserve)).cost
+        for loop in (cascade.loop, cascade.about(cascade.loop, still, 0.0))
+    ]
+    assert costs[1] == pytest.approx(costs[0], rel=1e-9)
 
 
 def test_each_target_is_seen_from_itself() -> None:

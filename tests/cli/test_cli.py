@@ -47,6 +47,7 @@ from undertow.studies.ledger import Key
 from undertow.studies.motion import ended
 
 RIG = "rotary_pendulum"
+SURFACE = "lambda_a=-1.59 alpha_u=1.96 lambda_u=12.1"
 CRANE = "overhead_crane"
 
 
@@ -200,14 +201,28 @@ def test_version_and_bare_call() -> None:
         (("simulate", RIG, "--control", "designed", "--accept", "local"), "local", "the cascade"),
         (("simulate", RIG, "--control", "one-time", "--belief", "usual"), "usual", "the cascade"),
         (("simulate", RIG, "--control", "designed", "--schedule", ".1"), "0.1 s", "the cascade"),
+        (("simulate", RIG, "--surface", SURFACE, "--period", ".2"), "0.2 s", "the cascade"),
         (("simulate", RIG, "--schedule", "99"), "99 s", "0 s to 60 s"),
+        (("certify", RIG, "--objective", "time"), "time, without --run", "with --run"),
+        (("certify", RIG, "--horizon", "3"), "3 s, without --run", "with --run"),
+        (("certify", "--appendix", "--surface", SURFACE), "lambda_a", "left out"),
+        (("certify", "--appendix", "--start", "phi=5deg"), "phi=5deg", "left out"),
+        (("certify", "--appendix", "--run"), "--run with --appendix", "left out"),
+        (("verify", "none.json", "--seconds", "9"), "9 s, without --both", "second checker"),
+        (("drill", "--systematic", "--kills", "3"), "3 kills, --systematic", "one of them"),
+        (("show", "run.db", "--objective", "time"), "time", "for a mechanism"),
+        (("show", "run.db", "--period", "0.2"), "0.2 s", "for a mechanism"),
+        (("show", "run.db", "--seed", "1"), "1", "for a mechanism"),
         (("animate", RIG, "--speed", "0"), "0.0", "> 0"),
         (("animate", RIG, "--longest", "-1"), "-1.0", "> 0"),
         (("derive", "robot.sdf"), "'.sdf'", ".urdf, .xml, .mjcf"),
         (("bench", RIG, "--quick", "--delay", "0.002"), "0.002 s", "one of them"),
         (("bench", RIG, "--delay", "-1"), "-1", "≥ 0"),
         (("export", "c", RIG, "--check", "--objective", "speed"), "'speed'", "bench-time"),
+        (("export", "c", RIG, "--check", "--objective", "time"), "time", "--control one-time"),
         (("export", "c", RIG, "--check", "--start", "psi=1deg"), "'psi'", "theta, phi"),
+        (("export", "c", RIG, "--check", "--start", "phi=1deg"), "phi=1deg", "one-time"),
+        (("export", "c", RIG, "--check", "--states", "9"), "9, without a report", "--report"),
         (("export", "c", RIG, "--check", "--velocity", "slow"), "'slow'", "derivative, super"),
         (
             ("export", "c", RIG, "--check", "--velocity", "kalman", "--time-constant", "0.1"),
@@ -351,8 +366,6 @@ def test_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path
 
 
 # -- work --------------------------------------------------------------------------------------
-
-SURFACE = "lambda_a=-1.59 alpha_u=1.96 lambda_u=12.1"
 
 
 def test_simulate_writes_the_motion_that_the_library_gives(tmp_path: Path) -> None:

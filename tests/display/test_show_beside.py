@@ -220,6 +220,29 @@ def test_a_map_that_took_long_at_first_is_soon_drawn_again() -> None:
     assert 2 <= len(maps.asked) <= 20
 
 
+def test_a_map_is_drawn_again_for_another_reaching_law() -> None:
+    """As a plan in reserve has it, whose surface may be that of the plan in use."""
+    maps = Now(lambda asked: {"kind": "region"})
+    looked = Beside(None, maps)
+    for clock, law in enumerate((ReachingLaw(), ReachingLaw(), ReachingLaw(80.0, 0.4))):
+        looked.draw(10.0 * clock, lambda: question(reaching=law))  # noqa: B023 - called at once
+        looked.take(10.0 * clock)
+    assert [asked.reaching for asked in maps.asked] == [ReachingLaw(), ReachingLaw(80.0, 0.4)]
+
+
+def test_a_map_about_a_target_keeps_within_the_travel() -> None:
+    """What begins past the end of the rail, 95 % of 1.5 m, is lost wherever the target is."""
+    cart = ut.mechanisms.cart_pendulum()
+    asked = question(
+        (1.7, 0.1), task=Task("bench-energy", (20.0,), 0.1), parameters=cart.parameter_values,
+        surface=first_surface(cart), goal=np.array([1.0, 0.0]), x=np.zeros(4), axis=0,
+    )  # fmt: skip
+    row = np.array([int(c) for c in maps_of(cart)(asked)["cells"]]).reshape(SIDE, SIDE)[SIDE // 2]
+    place = 1.7 * ((np.arange(SIDE) + 0.5) * 2.0 / SIDE - 1.0)
+    assert (row[np.abs(place) > 0.95 * 1.5] == LOST).all()
+    assert row[np.argmin(np.abs(place - 1.0))] == HOME
+
+
 def test_a_plane_that_is_none_is_refused(looked_at: tuple[Simulation, Now, Now]) -> None:
     no_axis = ((axis, [1, 1]) for axis in (2, 0.5, "0"))
     no_reach = ((0, reach) for reach in ([1], [0, 1], [1, 1e9], None))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import pickle
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -161,6 +162,28 @@ def test_reset_begins_again_with_the_same_first_plan(simulation: Simulation) -> 
     assert said[0]["kind"] == "reset"
     assert plans(said)[0]["rows"] == first["rows"]
     assert simulation.t == pytest.approx(0.1, abs=2 * TICK)
+
+
+def test_where_no_surface_is_found_after_a_reset_the_designed_one_is_used() -> None:
+    """Not the one that was in use before the reset, of which nothing is shown."""
+    worker = Deferred(COMPUTE)
+    simulation = Simulation(RIG, sketch(RIG), worker=worker)
+    simulation.ready.result(120)
+    worker.answer()
+    (found,) = worker.answers
+    simulation.advance(TICK)
+    assert simulation.law.surface != simulation._idle.surface
+    simulation.hear({"do": "set", "name": "objective", "value": "bench-time"}, 1)
+    simulation.hear({"do": "reset"}, 1)
+    simulation.advance(TICK)
+    none = replace(found.proposal, plan=None, status="infeasible")
+    worker.answers.append(replace(found, sequence=worker.asked[-1].sequence, proposal=none))
+    (told,) = plans(simulation.advance(TICK))
+    assert told["why"].startswith("no surface from here")
+    assert simulation.law.surface == simulation._idle.surface == ut.first_surface(RIG)
+    assert told["rows"] == simulation.law.surface.matrix.tolist()
+    law = ut.SlidingModeLaw(RIG, simulation.law.surface)
+    assert simulation.law(RIG.usual_start) == pytest.approx(law(0.0, RIG.usual_start).u)
 
 
 def test_a_hand_pulls_with_a_force_at_a_place(simulation: Simulation) -> None:
@@ -393,6 +416,17 @@ def test_a_mechanism_that_cannot_be_shown_is_refused_at_once() -> None:
     crane = ut.mechanisms.overhead_crane()
     with pytest.raises(InvalidInputError):
         Simulation(crane, sketch(crane), crane.state(x=9.0), worker=InlineWorker(planner(crane)))
+
+
+def test_a_recording_shows_the_layers_of_the_plans_own_reaching_laws() -> None:
+    small = ut.Budget(64)
+    cascade = ut.Cascade(RIG, ut.MinimumTime(), belief="exact", cold=small, warm=small)
+    run = cascade.simulate(phi=ut.deg(5), duration=0.02)
+    plan, own = run.updates[0].plan, ut.ReachingLaw(30.0, 0.5)
+    free = replace(plan, reaching=(own,) * len(plan.surfaces))
+    updates = [replace(run.updates[0], plan=one) for one in (replace(plan, reaching=None), free)]
+    message = of_run(replace(run, updates=tuple(updates)), cascade)
+    assert [one["layer"] for one in message["plans"]] == [[0.1], [0.5]]
 
 
 @pytest.mark.slow

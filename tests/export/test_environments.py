@@ -14,6 +14,7 @@ import undertow as ut
 from support import rest_slow
 from undertow.base import InvalidInputError, MissingExtraError
 from undertow.mechanisms import LIBRARY
+from undertow.plants import Bench
 
 gymnasium = pytest.importorskip("gymnasium")
 import undertow.export.gym as ours  # noqa: E402 - after Gymnasium was found
@@ -179,6 +180,7 @@ def test_a_picture_shows_where_it_stands() -> None:
     [
         ({"period": 0.0}, "period of an environment"),
         ({"period": 0.0015, "realistic": True}, "multiple of the bench's"),
+        ({"realistic": Bench(ut.mechanisms.cart_pendulum())}, "plant 'cart_pendulum'"),
         ({"penalty": -1.0}, "penalty"),
         ({"objective": "tme"}, "Did you mean time"),
         ({"render_mode": "human"}, "render_mode"),

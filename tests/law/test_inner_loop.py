@@ -59,6 +59,9 @@ def test_a_reaching_law_is_exchanged_with_the_surface_or_stays(
     law.use(quick, hard)
     assert law(x)[0] == pytest.approx(float(ut.SlidingModeLaw(rig, quick, hard)(0.0, x).u[0]))
     assert law(rig.state(phi=0.9)).tolist() == [-rig.inputs[0].limit]  # of 37 V that it asks for
+    smooth = ut.ReachingLaw(8.0, 0.2, "tanh")
+    law.use(quick, smooth)
+    assert law(x)[0] == pytest.approx(float(ut.SlidingModeLaw(rig, quick, smooth)(0.0, x).u[0]))
 
 
 def test_along_a_plan_the_surface_in_force_is_obeyed(

@@ -149,6 +149,9 @@ def test_times_begin_at_zero_and_rise(times: tuple[float, ...], good: bool) -> N
             Plan(surfaces, times)
 
 
+#: What a loop that is compiled for the saturation does not follow.
+ANOTHER = Plan(SURFACES[:1], reaching=(ut.ReachingLaw((5.0, 8.0), 0.2, "tanh"),))
+
 REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     "of two kinds": (lambda: Plan((SURFACES[0], random_surface(2, 1)), (0.0, 1.0)), "surfaces of"),
     "no surface": (lambda: Plan((SURFACES[0], 3.0), (0.0, 1.0)), "surfaces of"),  # type: ignore[arg-type]
@@ -158,6 +161,11 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     "too few laws": (lambda: Plan(SURFACES, TIMES, LAWS[:3]), "reaching laws of"),
     "laws that are none": (lambda: Plan(SURFACES[:1], reaching=(0.5,)), "reaching of Plan"),  # type: ignore[arg-type]
     "no plans": (lambda: Plan.align([], USUAL), "number of plans"),
+    "a law that switches otherwise": (lambda: ANOTHER.gains(USUAL), "one that switches by 'tanh'"),
+    "the same, beside others": (
+        lambda: Plan.align([Plan.of(SURFACES[2]), ANOTHER], USUAL),
+        "one that switches by 'tanh'",
+    ),
 }
 
 

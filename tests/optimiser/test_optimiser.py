@@ -218,6 +218,17 @@ def test_budget_in_seconds_still_answers(optimisers: dict[str, ut.Optimiser]) ->
     assert proposal.cost <= proposal.incumbent_cost
 
 
+def test_a_first_search_keeps_to_its_seconds_whatever_its_evaluations(
+    optimisers: dict[str, ut.Optimiser],
+) -> None:
+    """A sixth of them was drawn and rolled out before the clock was looked at."""
+    optimiser = optimisers["energy"]
+    x = optimiser.loop.mechanism.state(phi=0.4)
+    proposal = optimiser.propose(x, budget=ut.Budget(60_000, seconds=1e-9))
+    assert proposal.status == "budget spent"
+    assert proposal.evaluations < 2000
+
+
 def test_search_coordinates_are_invertible(optimisers: dict[str, ut.Optimiser]) -> None:
     """decode ∘ encode is the identity on normalised surfaces, of any sign."""
     decision = optimisers["energy"].space

@@ -180,6 +180,23 @@ def test_what_is_not_proved_has_no_file(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"hold": 1}, "hold: got 1, without loop=True"),
+        ({"loop_seconds": 3.0}, "loop_seconds: got 3, without loop=True"),
+        ({"uncertain": {"m": (0.1, 0.2)}}, "a region to prove it for"),
+        ({"uncertain": {"m": (0.1, 0.2)}, "loop": True}, "a held input"),
+    ],
+)
+def test_a_setting_of_a_proof_that_is_not_asked_for_is_refused(
+    settings: dict[str, Any], said: str
+) -> None:
+    """The certificate would have been the same without it."""
+    with pytest.raises(InvalidInputError, match=said):
+        ut.certify(RIG, SURFACE, seconds=0, **settings)
+
+
 def test_what_python_saves_the_command_line_verifies(tmp_path: Path) -> None:
     file = ut.certify(RIG, SURFACE, seconds=0).save(tmp_path / "certificate.json")
     assert ut.verify(file, RIG)

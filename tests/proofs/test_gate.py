@@ -188,6 +188,15 @@ def test_local_evidence_is_a_motion_that_arrives_where_the_loop_is_stable(
     assert words in verdict.method
 
 
+def test_local_evidence_keeps_to_the_margins_of_the_policy() -> None:
+    """The smallest det Γ/det Γ(0) of the predicted motion counts there, too."""
+    least = float(LOOP.batch(FAR, GOOD).singular[0])
+    for part, granted in ((0.999, True), (1.001, False)):
+        verdict = assess(LOOP, Plan.of(GOOD), FAR, 20.0, GatePolicy(("local",), part * least))
+        assert (verdict.kind == "sampled") is granted
+        assert granted or "singularity margin" in verdict.method
+
+
 @pytest.mark.slow
 def test_margins_of_the_policy_count() -> None:
     """A singularity close to the path, a constraint, a hard input limit."""
@@ -248,6 +257,8 @@ def test_sets_that_were_proved_before_are_used() -> None:
     plan = Plan((GOOD,), (0.0,), (faster,))
     assert assess(LOOP, plan, FAR, 20.0, only, [here]).kind == "undecided"
     assert assess(LOOP, plan, FAR, 20.0, only, [replace(here, reaching=faster)]).kind == "proved"
+    same = Plan((GOOD,), (0.0,), (ut.ReachingLaw((20.0,), (0.1,)),))  # as an optimiser writes it
+    assert assess(LOOP, same, FAR, 20.0, only, [here]).kind == "proved"
 
 
 def test_a_schedule_is_judged_by_its_last_surface() -> None:

@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -192,6 +193,14 @@ def test_after_a_knock_a_plan_in_reserve_takes_over_and_a_decision_comes_early()
     assert answers[1][0] < jump + 0.025  # the decision, whatever the gate makes of it
     assert abs(rig.truth[1]) < 0.1
     assert controller.mode in (Mode.CATCH, Mode.BALANCE)
+
+
+@pytest.mark.parametrize(("asked", "kept"), [(0.5, 0.5), (1.5, math.radians(60.0))])
+def test_with_a_swing_up_the_smaller_angle_has_fallen(asked: float, kept: float) -> None:
+    """That of the settings was passed over."""
+    recipe = replace(SWINGING, settings=Settings(fall_angle=asked))
+    controller = recipe.make_controller(SWINGING.first())
+    assert controller._fall_angle == pytest.approx(kept)
 
 
 @pytest.mark.slow
@@ -538,6 +547,26 @@ def test_a_lead_time_grows_with_late_answers_and_shrinks_with_early_ones(lates: 
         assert abs(lead.seconds / 0.002 - round(lead.seconds / 0.002)) < 1e-9
         bound = 0.5 if late else 0.02
         assert (lead.seconds > before) == late or lead.seconds in (before, pytest.approx(bound))
+
+
+@pytest.mark.parametrize(
+    ("asked", "lead"), [(None, 0.04), (Settings(), 0.1), (Settings(lead_time=0.02), 0.02)]
+)
+def test_a_run_is_planned_as_often_as_its_cascade_says(
+    asked: Settings | None, lead: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Unless settings say how far ahead; the period of the cascade had meant nothing to a run."""
+    made: list[Recipe] = []
+
+    def prepared(recipe: Recipe, **_: object) -> None:
+        made.append(recipe)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(import_module("undertow.runtime.session"), "session", prepared)
+    cascade = ut.Cascade(ut.mechanisms.rotary_pendulum(), period=0.04, belief="exact")
+    with pytest.raises(KeyboardInterrupt):
+        ut.run(cascade, settings=asked, simulated=True)
+    assert made[0].settings.lead_time == lead
 
 
 def test_a_run_of_no_length_is_refused_with_what_to_do() -> None:

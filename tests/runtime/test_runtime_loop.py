@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import undertow as ut
 from runs import RECIPE
 from support import rest_slow
 from undertow.base import InvalidInputError
@@ -23,6 +24,7 @@ from undertow.runtime import (
     Mode,
     Recipe,
     Runtime,
+    Settings,
     SimulatedClock,
     about,
     background_worker,
@@ -201,6 +203,40 @@ def test_a_stop_before_the_run_is_kept_and_a_second_run_refused(controller: Cont
     assert runtime.report.steps == 1
     with pytest.raises(InvalidInputError, match="another session"):
         runtime.run(1.0)
+
+
+@pytest.mark.parametrize("designed", [False, True])
+def test_plans_are_made_with_the_output_that_the_settings_leave(designed: bool) -> None:
+    """They counted on the whole input, and a run with a third of it was lost by their plans."""
+    rig = ut.mechanisms.rotary_pendulum()
+    cascade = ut.Cascade(rig, ut.MinimumTime(), belief=ut.Belief.relative(rig, m=0.2))
+    recipe = Recipe(
+        rig, objective=cascade.objective, design=cascade if designed else None,
+        settings=Settings(output_limit=5.0),
+    )  # fmt: skip
+    suited = recipe.cascade
+    assert suited.loop.input_limits == recipe.make_estimator().mechanism.input_limits == [5.0]
+    assert suited.known is not None
+    assert suited.known.mechanism is suited.mechanism
+    assert not designed or list(suited.known.tolerances) == ["m"]
+    assert rig.input_limits == [15.0]
+    whole = replace(recipe, settings=Settings(output_limit=20.0))
+    assert whole.cascade.loop.input_limits == [15.0]
+
+
+def test_a_limit_of_the_output_leaves_the_objective_as_it_is() -> None:
+    """What an input costs, as a part of the mechanism's own limit; and a log can still name it."""
+    rig = ut.mechanisms.rotary_pendulum()
+    cascade = ut.Cascade(rig)
+    recipe = Recipe(
+        rig, objective=cascade.objective, horizon=60.0, design=cascade,
+        settings=Settings(output_limit=5.0),
+    )  # fmt: skip
+    written = recipe.in_names()
+    assert written is not None
+    again = Recipe.from_dict(written.as_dict())
+    assert again.belief.fingerprint == recipe.belief.fingerprint
+    assert again.cascade.objective == recipe.cascade.objective == cascade.objective
 
 
 @pytest.mark.parametrize("period", [0.0, 0.15, float("nan")])

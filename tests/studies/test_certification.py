@@ -68,7 +68,15 @@ def test_the_log_of_a_run_has_a_verdict_for_each_decision(run: ut.Run) -> None:
         assert decision["reason"] == update.admission.reason
         assert decision["verdict"]["kind"] in ("proved", "sampled", "undecided")
         assert decision["surface"] == update.surface.vector.tolist()
+        (whole,) = decision["plan"]
+        assert whole == {"from": 0.0, "surface": decision["surface"], "eta": [20.0], "layer": [0.1]}
     assert decisions[-1]["verdict"]["evidence"] in ("region", "dual")
+    own = ut.Plan((GOOD, GOOD), (0.0, 0.1), (ut.ReachingLaw(5.0, 0.2), ut.ReachingLaw(6.0, 0.3)))
+    free = replace(run, updates=(replace(run.updates[0], plan=own),))
+    files = motion.motion_files({}, run.trajectory, run.cost, run.surfaces, free)
+    (decision,) = json.loads(files["manifest.json"])["decisions"]
+    told = [(one["from"], one["eta"], one["layer"]) for one in decision["plan"]]
+    assert told == [(0.0, [5.0], [0.2]), (0.1, [6.0], [0.3])]
     start = RIG.state(phi=0.2)
     shown = text(motion.motion_report(RIG, GOAL, start, run.trajectory, run.surfaces[0], run))
     assert "evidence" in shown

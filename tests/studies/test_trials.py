@@ -19,7 +19,7 @@ from undertow.base import ArtefactError, InvalidInputError, as_text
 from undertow.cascade import CascadeState
 from undertow.cascade.robustness import BenchGate
 from undertow.estimators import Record
-from undertow.law import Plan
+from undertow.law import Plan, usual_reaching
 from undertow.models import FloatArray
 from undertow.models.importers import holding_input
 from undertow.objective import objective_for
@@ -80,6 +80,16 @@ def test_predictive_control_for_a_cost_that_no_input_raises_is_refused(
     objective = ut.Objective("free", lambda v: sp.sympify(free, {"theta": v.theta}))
     with pytest.raises(InvalidInputError, match=r"∂²Φ/∂u² = \[\[0.0\]\].*bench-time"):
         ut.nmpc(arm, objective)
+
+
+def test_predictive_control_is_not_asked_for_constraints_that_it_does_not_keep(
+    arm: ut.Mechanism,
+) -> None:
+    bounded = ut.MinimumEnergy(constraints=ut.state_box(theta=0.5))
+    with pytest.raises(
+        InvalidInputError, match=r"constraints of an objective for NMPC: got .*theta"
+    ):
+        ut.nmpc(arm, bounded)
 
 
 @pytest.mark.slow
@@ -246,6 +256,24 @@ def test_a_fixed_law_is_that_of_the_formulas(arm: ut.Mechanism, base: ut.Surface
         x = arm.state(phi=angle, theta_dot=speed)
         np.testing.assert_allclose(controller(t, x), formulas(t, x).u, rtol=1e-9)
     assert abs(formulas(0.0, x).demand[0]) > 15.0 == abs(controller(0.0, x)[0])
+
+
+def test_a_surface_is_kept_with_the_layer_that_disturbances_ask_for(
+    arm: ut.Mechanism, base: ut.Surface
+) -> None:
+    """As in simulation, where the usual layer is refused as too thin."""
+    rubbing = arm.with_disturbance_bounds(0.5, 0.0)
+    usual, x = usual_reaching(rubbing, base), arm.state(phi=0.005)
+    u = keeping(rubbing, base)(x)(0.0, x)
+    assert u == pytest.approx(ut.SlidingModeLaw(rubbing, base, usual)(0.0, x).u, rel=1e-9)
+    assert abs(u - ut.SlidingModeLaw(rubbing, base)(0.0, x).u) > 0.5
+
+
+def test_a_cascade_of_another_mechanism_is_not_compared(arm: ut.Mechanism) -> None:
+    """Its law acted on coordinates and inputs that it does not know."""
+    other = ut.Cascade(ut.mechanisms.cart_pendulum(), belief="exact")
+    with pytest.raises(InvalidInputError, match="plant 'cart_pendulum' of the belief 'rotary"):
+        ut.compare(arm, [other], plants=[arm], seconds=0.01, phi=0.1)
 
 
 @pytest.mark.slow

@@ -250,7 +250,8 @@ def _check(
     intervals: int,
 ) -> float:
     """Refuse what cannot be solved before any long work; return the horizon."""
-    for coordinate, value in zip(mechanism.coordinates, start, strict=False):
+    travels = mechanism.coordinates if objective.travel else ()
+    for coordinate, value in zip(travels, start, strict=False):
         if not coordinate.low <= value <= coordinate.high:
             raise InvalidInputError(
                 f"initial {coordinate.name} of '{mechanism.name}'",

@@ -82,7 +82,8 @@ class Cascade:
         Reaching law of the inner loop; by default :func:`undertow.law.usual_reaching`: the paper's,
         its boundary layer as thick as the mechanism's disturbance bounds ask for.
     period
-        Δt between re-optimisations, s.
+        Δt between re-optimisations, s; of a run on a rig the lead time where no settings say
+        another, see :func:`undertow.run`.
     first
         First surface, checked; designed by itself by default.
     step, zoh_steps
@@ -317,6 +318,7 @@ class Cascade:
         error = state.error(state.since, self.mechanism.check_state(x))
         known = state.estimate
         loop = self.predictions.single(known) or self.predictions.plausible(known)
+        loop = self.about(loop, state.target, state.since)  # whose travel is not counted from it
         return replace(state, after_jump=self._reserve.after_jump(loop, state.plan, error))
 
     @checked

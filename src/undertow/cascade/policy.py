@@ -135,7 +135,8 @@ class _CascadeEpisode:
     """The cascade: decisions fall in the periods in which they are due, and take no time.
 
     As in :meth:`undertow.Cascade.simulate` what moves is learnt some times between two of them, and
-    what is learnt may call for another one.
+    what is learnt may call for another one; and the task is to be done within the horizon of the
+    objective, from the beginning of the episode or from when it was last at the target.
     """
 
     def __init__(self, cascade: Cascade, period: float) -> None:
@@ -144,7 +145,7 @@ class _CascadeEpisode:
         self._planned_with: ParameterEstimate | None = None
         self._x: list[FloatArray] = []
         self._u: list[FloatArray] = []
-        self._k = 0
+        self._k, self._since = 0, 0.0
         self._decides, self._learns = (
             max(1, round(span / period)) for span in (cascade.period, LEARNING)
         )
@@ -153,19 +154,30 @@ class _CascadeEpisode:
         cascade, t = self._cascade, self._k * self._period
         if self._memory is None:
             self._memory, _ = cascade.start(x)
+            self._planned_with = self._memory.estimate
         elif self._k % self._learns == 0 or self._k % self._decides == 0:
             self._memory = self._learnt(self._memory)
             due = self._k % self._decides == 0
             due = due or is_news(self._planned_with, self._memory.estimate)
             if due or not cascade.survives(self._memory, x, t):
-                proposal = cascade.propose(self._memory, x, t)
-                self._memory, _ = cascade.apply_gate(self._memory, proposal, x)
+                left = self._left(x, t)
+                proposal = cascade.propose(self._memory, x, t, left)
+                self._memory, _ = cascade.apply_gate(self._memory, proposal, x, left)
                 self._planned_with = self._memory.estimate
         u = cascade.control(self._memory, t, x).u
         self._x.append(x)
         self._u.append(u)
         self._k += 1
         return u
+
+    def _left(self, x: FloatArray, t: float) -> float:
+        """Return the time that is left for the task, s: where it is over another one begins."""
+        objective = self._cascade.objective
+        left = objective.horizon - (t - self._since)
+        if np.linalg.norm(x) > objective.terminal_radius and left > 0.5 * self._cascade.step:
+            return left
+        self._since = t
+        return objective.horizon
 
     def _learnt(self, memory: CascadeState) -> CascadeState:
         """Return the memory with what the motion since the last time shows of the plant.
@@ -231,7 +243,9 @@ def policy(
         what = f"limit of input '{given.name}' of '{mechanism.name}'"
         remedy = f"Give it an Input({given.name!r}, limit=…): an action of 1 is the whole input"
         positive(what, given.limit, remedy)
-    controller.reaching.check_period("period of a policy", period, mechanism.m)
+    plan = None if surfaces is None else Plan.of(surfaces)
+    for law in [controller.reaching] if plan is None else plan.laws(controller.reaching):
+        law.check_period("period of a policy", period, mechanism.m)
     if cascade is not None:
         count = cascade.period / period
         if abs(count - round(count)) > 1e-6:
@@ -243,6 +257,6 @@ def policy(
             )
         return Policy(mechanism, partial(_CascadeEpisode, cascade, period), period)
     assert isinstance(controller, ClosedLoop)  # no cascade
-    assert surfaces is not None  # no cascade
-    begin = partial(_PlanEpisode, controller, Plan.of(surfaces), period)
+    assert plan is not None  # no cascade
+    begin = partial(_PlanEpisode, controller, plan, period)
     return Policy(mechanism, begin, period)

@@ -15,7 +15,7 @@ import numpy as np
 import sympy as sp
 
 from undertow.base import InvalidInputError
-from undertow.closed_loop import ClosedLoop, Ensemble
+from undertow.closed_loop import ClosedLoop
 from undertow.law import ReferenceMotion, Target, target_of
 from undertow.models import FloatArray, Mechanism, invariant_coordinates, with_positions
 from undertow.objective import Objective
@@ -106,7 +106,7 @@ class LoopsAbout:
         if ensemble is not None:
             values = np.hstack([ensemble.values, np.tile(positions, (len(ensemble), 1))])
             plant = self._mechanism(ensemble.plant, positions)
-            ensemble = Ensemble(plant, values, ensemble.risk, ensemble.weights)
+            ensemble = replace(ensemble, plant=plant, values=values)
         moved = None if loop.plant is None else self._mechanism(loop.plant, positions)
         key = (
             loop.reaching, loop.step, loop.zoh_steps, loop.rtol, loop.tail_rtol, loop.escape,

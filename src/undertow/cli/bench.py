@@ -12,7 +12,7 @@ from rich.console import Group
 
 from undertow.base import InvalidInputError
 from undertow.cli import options
-from undertow.cli.parsing import mechanism_named
+from undertow.cli.parsing import mechanism_named, parse_values
 from undertow.cli.terminal import (
     check_out,
     command,
@@ -83,6 +83,7 @@ def bench(
             remedy="Leave --quick out",
         )
     request = {"mechanism": name, "rig": rig, "fault": fault or [], "seed": seed}
+    request |= {"setting": setting or [], "delay": delay, "quick": quick}
     belief = mechanism_named(name, setting)
     rest, faults = rest_state(belief), fault or ()
     check_out(out)
@@ -108,7 +109,7 @@ def bench(
         show(table)
         if found.identification is not None:
             show(Group("", parameter_table(found.identification)))
-        said = handed_on(name, rig, found) if in_a_file(rig) else ()
+        said = handed_on(name, rig, found, parse_values(setting)) if in_a_file(rig) else ()
         show(*summary(found), *said, *written)
         exit_unless(not found.wrong)
 

@@ -124,6 +124,12 @@ def certify(
     region = not run and (bool(seconds) if seconds is not None or appendix else True)
     require(appendix == (name is None), "undertow certify", given, "a mechanism, or --appendix")
     require(not (run and surface is not None), "--surface with --run", surface, alone)
+    for what, value in (("--run", run), ("--surface", surface), ("--start", start)):
+        words = "left out: the paper's cases have surfaces and starts of their own"
+        require(not (appendix and value), f"{what} with --appendix", value, words)
+    ways = "with --run, whose cascade it is for"
+    require(run or objective == "energy", "--objective", f"{objective}, without --run", ways)
+    require(run or horizon == 60.0, "--horizon", f"{horizon:g} s, without --run", ways)
     require(timed, "--seconds", seconds, "in [0, 100000)")
     require(not (run and seconds), "--seconds", f"{seconds} s, with --run", brief)
     require(not (run and loop), "--loop", "with --run", brief)
@@ -257,6 +263,8 @@ def verify(
     from undertow.studies import certification
     from undertow.studies.second_checker import agreement_table, decide_again
 
+    waits = both or seconds == 600.0
+    require(waits, "--seconds", f"{seconds:g} s, without --both", "with the second checker")
     certificate = read_certificate(file)
     check_settings(certificate, parse_values(setting))
     known = mechanism is not None or certificate.name in LIBRARY

@@ -111,6 +111,7 @@ def simulate(
         "--accept": ", ".join(accept or ()),
         "--belief": known,
         "--schedule": f"{schedule:g} s" if schedule else "",
+        "--period": f"{period:g} s" if period != 0.1 else "",
     }
     for what, value in of_cascade.items():
         if value and steering != "cascade":
@@ -157,7 +158,9 @@ def simulate(
     said = motion_report(
         belief, goal, x0, motion, surfaces[0], run, cascade, goes_to, words, loop.reaching
     )
-    written = write(out, lambda: motion_files(request, motion, motion.cost, surfaces, run), said)
+    written = write(
+        out, lambda: motion_files(request, motion, motion.cost, surfaces, run, loop.reaching), said
+    )
     show(said, *written)
     exit_unless(motion.event.name == "REACHED")
 

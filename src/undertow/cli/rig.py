@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 import typer
 from rich.console import RenderableType
 
-from undertow.base import InvalidInputError, printable
+from undertow.base import InvalidInputError, printable, require
 from undertow.cascade import problem_words
 from undertow.cli import options
 from undertow.cli.parsing import (
@@ -394,6 +394,8 @@ def drill(
     """
     from undertow.studies import fault_injection
 
+    instead = f"{kills} kills, {'--systematic' if systematic else '--only'}"
+    require(kills is None or not (systematic or only), "--kills", instead, "one of them")
     if systematic or only:
         _systematic(only or (), seed)
         return

@@ -118,11 +118,16 @@ def show(
         raise InvalidInputError(
             "--mechanism", value=mechanism, limit="for a log, FILE.db", remedy="Leave it out"
         )
-    for what, given in (("--start", start), ("--set", setting), ("--limit", limit)):
+    shown_as = {
+        "--start": ", ".join(start or ()), "--set": ", ".join(setting or ()),
+        "--limit": ", ".join(limit or ()), "--objective": objective if objective != USUAL else "",
+        "--period": f"{period:g} s" if period != 0.1 else "", "--seed": str(seed or ""),
+    }  # fmt: skip
+    for what, given in shown_as.items():
         if log and given:
             raise InvalidInputError(
                 f"{what} with a log",
-                value=", ".join(given),
+                value=given,
                 limit="for a mechanism: what a log shows has been",
                 remedy="Leave it out",
             )

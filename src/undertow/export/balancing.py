@@ -75,8 +75,8 @@ class BalancingTask:
     Raises
     ------
     InvalidInputError
-        For an input without a limit, a mechanism without a usual start, and a period that is no
-        multiple of the bench's.
+        For an input without a limit, a mechanism without a usual start, a bench of another
+        mechanism, and a period that is no multiple of the bench's.
     """
 
     mechanism: Mechanism
@@ -106,6 +106,7 @@ class BalancingTask:
         at_least("penalty of an environment", self.paid, 0, "0 pays nothing for falling")
         objective.check_start(self.mechanism, self.mechanism.usual_start)
         if self.bench is not None:
+            self.mechanism.check_plant(self.bench.mechanism)
             count = self.period / self.bench.timing.period
             if not (count > 0.5 and abs(count - round(count)) < 1e-6):
                 raise InvalidInputError(

@@ -82,6 +82,8 @@ class InnerLoop:
         """
         law = SlidingModeLaw(self.mechanism, surface, reaching or self.reaching)
         self.lane = pack_law_parameters(law)
+        if law.reaching.switching != self.reaching.switching:
+            vars(self).pop("_step", None)  # compiled for one switching function
         self.surface, self.reaching = surface, law.reaching
 
     def follow(self, plan: Plan, elapsed: float, otherwise: ReachingLaw) -> None:

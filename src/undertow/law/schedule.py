@@ -145,9 +145,9 @@ class Plan:
         """Return common times (S), surface vectors (N, S, 2mn) and gains (N, S, 2m)."""
         at_least("number of plans", len(plans), 1, "Give at least one")
         times = tuple(sorted({t for plan in plans for t in plan.times}))
-        vectors = [[plan.at(t)[0].vector for t in times] for plan in plans]
-        m = plans[0].surfaces[0].m
-        gains = [[(plan.at(t)[1] or otherwise).vector(m) for t in times] for plan in plans]
+        rows = [(plan, [plan._index(t) for t in times]) for plan in plans]
+        vectors = [plan.vectors[places] for plan, places in rows]
+        gains = [plan.gains(otherwise)[places] for plan, places in rows]
         return times, np.array(vectors), np.array(gains)
 
     @property
@@ -155,9 +155,26 @@ class Plan:
         """Surface vectors, (S, 2mn)."""
         return np.stack([surface.vector for surface in self.surfaces])
 
+    @checked
     def laws(self, otherwise: ReachingLaw) -> tuple[ReachingLaw, ...]:
-        """Return the reaching law of each surface, ``otherwise`` where none is given."""
-        return self.reaching or (otherwise,) * len(self.surfaces)
+        """Return the reaching law of each surface, ``otherwise`` where none is given.
+
+        Raises
+        ------
+        InvalidInputError
+            For a law that switches by another function than ``otherwise``: a loop is compiled for
+            one.
+        """
+        laws = self.reaching or (otherwise,) * len(self.surfaces)
+        for law in laws:
+            if law.switching != otherwise.switching:
+                raise InvalidInputError(
+                    "reaching laws of a plan",
+                    value=f"one that switches by '{law.switching}'",
+                    limit=f"'{otherwise.switching}' throughout, as what the plan is used in",
+                    remedy=f"Give that reaching=ReachingLaw(switching='{law.switching}'), too",
+                )
+        return laws
 
     @checked
     def gains(self, otherwise: ReachingLaw) -> FloatArray:

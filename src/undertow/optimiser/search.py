@@ -17,6 +17,7 @@ References
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from functools import cache
 from itertools import chain
@@ -37,6 +38,9 @@ from undertow.optimiser.trust_region import TrustRegion
 
 #: Largest number of coordinates for a model search: its model has 55 terms then.
 MODEL_SIZE = 9
+
+#: Draws that are rolled out between two looks at the clock, where the time is limited.
+TOGETHER = 512
 
 #: Fruitless looks around that end a re-optimisation.
 LOOKS = 2
@@ -186,9 +190,8 @@ def _own_search(task: Optimisation) -> Iterator[bool]:
         yield False
     optimiser, rng, total = task.optimiser, task.rng, task.evaluations + task.left
     draws = max(optimiser.population, total // 6)
-    drawn = task.firsts[0] + task.space.steps(rng, np.ones(draws))
-    drawn = drawn[: max(1, task.left)]
-    z, scores = np.vstack([z, drawn]), np.concatenate([scores, task.cost(drawn)])
+    drawn, costs = zip(*_draws(task, draws), strict=True)
+    z, scores = np.vstack([z, *drawn]), np.concatenate([scores, *costs])
     if not scores.min() < UNSTABLE:  # not one that may be rolled out: nothing to go by
         yield False
         return
@@ -208,6 +211,17 @@ def _own_search(task: Optimisation) -> Iterator[bool]:
         task.kept = 0
         task.switch_at(_division(task))
         yield _descend(task, task.centre, 0.1, task.left, 1e-4)
+
+
+def _draws(task: Optimisation, count: int) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Yield draws about the first design, (N, d), and their costs: as many as there is time for."""
+    together = count if math.isinf(task.budget.seconds) else TOGETHER
+    for first in range(0, count, together):
+        if first and (task.left <= 0 or task.late()):
+            return
+        z = task.firsts[0] + task.space.steps(task.rng, np.ones(min(together, count - first)))
+        z = z[: max(1, task.left)]
+        yield z, task.cost(z)
 
 
 def _near_one_plant(task: Optimisation) -> None:

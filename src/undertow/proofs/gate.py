@@ -136,8 +136,14 @@ class _Case:
         return [
             s
             for s in self.sets
-            if s.surface == self.surface and s.reaching == self.law and s.model in own
+            if s.surface == self.surface and self._is_law(s.reaching) and s.model in own
         ]
+
+    def _is_law(self, other: ReachingLaw) -> bool:
+        """Whether another law is this one, its numbers for all surfaces or one by one."""
+        m, law = self.surface.m, self.law
+        alike = np.array_equal(other.vector(m), law.vector(m))
+        return other.switching == law.switching and alike
 
     def proved_at(self, x: FloatArray) -> tuple[float, str] | None:
         """Whether a state is in a set that is proved, or can be on the spot; margin, method."""
@@ -296,6 +302,9 @@ def _local(case: _Case) -> Verdict | str:
     batch = case.loop.batch(case.x, case.plan, duration=case.horizon)
     if not batch.reached.all():
         return f"the predicted motion ends: {_event(batch)}"
+    margins = _Margins(case.policy)
+    if broken := margins.broken(case.loop, batch.singular, batch.path, batch.input):
+        return broken
     return Verdict(
         "the predicted motion reaches the target, where the closed loop is stable",
         "sampled",

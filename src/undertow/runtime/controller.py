@@ -146,7 +146,8 @@ class Controller:
         settings = Settings() if settings is None else settings
         self.cascade, self.estimator, self.period = cascade, estimator, period
         self.settings, self.swing_up = settings, swing_up
-        self._fall_angle = settings.fall_angle if swing_up is None else swing_up.lost
+        lost = math.inf if swing_up is None else swing_up.lost
+        self._fall_angle = min(settings.fall_angle, lost)
         moving = [motion for _, motion in legs if motion.moves]
         self.reference = moving[0] if moving else None
         acted_on = error_dynamics(mechanism) if moving else mechanism

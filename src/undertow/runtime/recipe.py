@@ -14,7 +14,7 @@ import numpy as np
 from undertow.base import InvalidInputError, UndertowError, a_kind, check_fields, one_of, positive
 from undertow.cascade import Cascade, CascadeState, Legs, derate_actuator
 from undertow.cascade.swing_up import CatchRegion, SwingUpAndCatch, designed, hanging
-from undertow.estimators import Estimator, MakeEstimator
+from undertow.estimators import Belief, Estimator, MakeEstimator
 from undertow.law import Plan, Reference, ReferenceMotion, SetPoints
 from undertow.mechanisms import LIBRARY
 from undertow.mechanisms.named import named
@@ -177,7 +177,13 @@ class Recipe:
 
     @cached_property
     def belief(self) -> Mechanism:
-        """The controller's model."""
+        """The controller's model, its inputs limited as the settings have it."""
+        whole, limits = self._whole, self.settings.limits(self._whole)
+        return whole.with_input_limit(*limits) if (limits < whole.input_limits).any() else whole
+
+    @cached_property
+    def _whole(self) -> Mechanism:
+        """The same with the whole of its inputs, which words for an objective are about."""
         known = named(self.mechanism) if isinstance(self.mechanism, str) else self.mechanism
         return known.with_parameters(**self.parameters)
 
@@ -200,7 +206,7 @@ class Recipe:
             known_goals = (
                 word
                 for word in get_args(Goal)
-                if objective_for(made.belief, word, horizon=goal.horizon) == goal.on(belief)
+                if objective_for(made._whole, word, horizon=goal.horizon) == goal.on(belief)
             )
             named_goal = next(known_goals, None)
             if named_goal is None or goal.horizon > FARTHEST:
@@ -239,11 +245,17 @@ class Recipe:
     @cached_property
     def _designed(self) -> Cascade:
         """The cascade as it is for exact states."""
-        if self.design is not None:
-            return self.design
+        design = self.design
+        if design is not None:
+            if (design.mechanism.input_limits == self.belief.input_limits).all():
+                return design
+            about = design.belief
+            if isinstance(about, Belief):
+                about = replace(about, mechanism=self.belief)
+            return replace(design, mechanism=self.belief, belief=about)
         goal = self.objective
         if not isinstance(goal, Objective):
-            goal = objective_for(self.belief, goal, horizon=self.horizon)
+            goal = objective_for(self._whole, goal, horizon=self.horizon)
         known: Literal["usual", "exact"] = "usual" if self.learns else "exact"
         return Cascade(self.belief, goal, seed=self.seed, belief=known)
 

@@ -242,7 +242,8 @@ def run(
     processes
         For the optimiser; 0: a thread.
     settings
-        Limits and timeouts of the run.
+        Limits and timeouts of the run; by default a plan is asked for the cascade's period ahead,
+        ``Settings(lead_time=cascade.period)``: one follows another, so that is how often.
     target
         Where to, x = 0 by default: coordinates to positions, or :class:`undertow.SetPoints` that
         jump at times since the start of the run, each as soon as there is a plan for it; or a
@@ -271,7 +272,7 @@ def run(
     ArtefactError
         When the rig cannot be read, or the log cannot be written.
     """
-    mechanism, settings = cascade.mechanism, settings or Settings()
+    mechanism, settings = cascade.mechanism, settings or Settings(lead_time=cascade.period)
     with closed_on_failure(rig) as kept:
         positive("length of a run, s", seconds, "Leave it out for 20 s")
         if rig is not None:

@@ -18,7 +18,8 @@ class Settings:
     Parameters
     ----------
     output_limit
-        Largest |u|, in the input's unit; the mechanism's own limits apply besides.
+        Largest |u|, in the input's unit; the mechanism's own limits apply besides.  Plans are made
+        with what is left.
     slew_time
         Shortest time in which an input may cross its whole range, s: the slew rate is
         2 u_max / slew_time.  Inputs without a limit have none on their rate either.
@@ -49,9 +50,11 @@ class Settings:
     min_margin
         det Γ(q)/det Γ(0) below which the law is taken to be lost, (37).
     max_travel
-        Largest |q_i|, rad or m, besides the ranges of the coordinates.
+        Largest |q_i|, rad or m, besides the ranges of the coordinates: where a run is stopped.
+        Plans keep to the ranges alone.
     fall_angle
-        A free angle further than this from the target has fallen, rad.
+        A free angle further than this from the target has fallen, rad; with a swing-up one further
+        than 60° in any case.
     max_state_norm
         ‖x‖₂ beyond which the motion has escaped, whatever the predictions' own limit.
     max_step_interval

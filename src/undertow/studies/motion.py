@@ -13,7 +13,7 @@ from undertow.base import facts, finite, manifest, mark, table, to_csv
 from undertow.cascade import Cascade, Gate, Run, Update, problem_words
 from undertow.closed_loop import Event, Trajectory
 from undertow.closed_loop.figures import display, figure_bytes, motion_figure, state_words
-from undertow.law import ReachingLaw, Surface, Target
+from undertow.law import Plan, ReachingLaw, Surface, Target
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import Objective
 from undertow.optimiser import Proposal
@@ -197,13 +197,24 @@ def evidence_counts(run: Run, words: Mapping[str, str] = _EVIDENCE) -> str:
     return ", ".join(f"{kinds.count(kind)} {text}" for kind, text in rows if kinds.count(kind))
 
 
-def _decision(update: Update) -> dict[str, object]:
+def _surfaces_of(plan: Plan, reaching: ReachingLaw) -> list[dict[str, object]]:
+    """Return the surfaces of a plan, each with when it takes over, s, and how it is reached."""
+    m = plan.surfaces[0].m
+    rows = zip(plan.times, plan.vectors.tolist(), plan.gains(reaching).tolist(), strict=True)
+    return [
+        {"from": begin, "surface": surface, "eta": gains[:m], "layer": gains[m:]}
+        for begin, surface, gains in rows
+    ]
+
+
+def _decision(update: Update, reaching: ReachingLaw) -> dict[str, object]:
     admission, verdict = update.admission, update.admission.verdict
     return {
         "t": update.t,
         "admitted": admission.accepted,
         "reason": admission.reason,
         "surface": update.surface.vector.tolist(),
+        "plan": _surfaces_of(update.plan, reaching),
         "predicted_cost": finite(admission.cost),
         "verdict": None
         if verdict is None
@@ -224,10 +235,12 @@ def motion_files(
     cost: float,
     surfaces: Sequence[Surface],
     run: Run | None = None,
+    reaching: ReachingLaw = ReachingLaw(),
 ) -> dict[str, bytes]:
     """Return a motion's files: ``motion.csv`` (SI units), ``motion.png``, ``manifest.json``.
 
-    The manifest keeps the request, and of a cascade's ``run`` every decision with its verdict.
+    The manifest keeps the request, and of a cascade's ``run`` every decision with its verdict and
+    the whole plan; ``reaching`` is how plans are reached that do not say it themselves.
     """
     *names, _ = motion.columns
     columns = (motion.t, *(values for values, _ in motion.columns.values()))
@@ -239,7 +252,7 @@ def motion_files(
         "surfaces": [surface.vector.tolist() for surface in surfaces],
     }
     if run is not None:
-        more["decisions"] = [_decision(update) for update in run.updates]
+        more["decisions"] = [_decision(update, reaching) for update in run.updates]
     return {
         "motion.csv": to_csv(["t", *names, "margin_37"], content),
         "motion.png": figure_bytes(motion_figure({"motion": motion})),

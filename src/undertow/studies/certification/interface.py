@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from undertow.base import Progress, checked, no_progress, positive, versions
+from undertow.base import Progress, checked, no_progress, positive, require, versions
 from undertow.law import ReachingLaw, Surface, usual_reaching
 from undertow.models import Mechanism, StateLike
 from undertow.proofs import Certificate, read_certificate
@@ -51,9 +51,11 @@ def certify(
         state that is not 0, else in a box, all of them at once with both signs.
     loop_seconds
         Process time of the search for that, s; the proof takes about as much again.
-    hold, uncertain
-        For that proof: the input is held for so many steps of 1 ms (0: at every instant), and
-        plant parameters lie in [low, high] instead of being the law's own.
+    hold
+        For that proof: the input is held for so many steps of 1 ms (0: at every instant).
+    uncertain
+        Plant parameters that lie in [low, high] instead of being the law's own: for that proof,
+        with an input that is held, and for a second region on the surface.
     progress
         Called with (what, part done).
 
@@ -67,6 +69,8 @@ def certify(
     ------
     ModelError
         For a mechanism that is not smooth.
+    InvalidInputError
+        For a setting of a proof that is not asked for.
 
     Examples
     --------
@@ -78,6 +82,13 @@ def certify(
     """
     positive("time of the search, s", seconds, zero=True)
     positive("time of the loop's search, s", loop_seconds)
+    given, own = "without loop=True", "left out: it is for the closed loop's proof"
+    require(loop or not hold, "hold", f"{hold}, {given}", own)
+    require(loop or loop_seconds == LOOP_SECONDS, "loop_seconds", f"{loop_seconds:g}, {given}", own)
+    bears = "a region to prove it for, seconds above 0, or loop=True"
+    require(loop or seconds or not uncertain, "uncertain", uncertain, bears)
+    held = "a held input, such as hold=1"
+    require(hold or not (loop and uncertain), "uncertain, with loop=True", uncertain, held)
     known = x0 is not None or state or mechanism.start
     start = mechanism.initial_state(x0, state) if known else np.zeros(2 * mechanism.n)
     certified = certify_surface(

@@ -19,9 +19,10 @@ import numpy as np
 
 from undertow.base import UndertowError
 from undertow.bounds import Bound, bound
+from undertow.cascade import Cascade
 from undertow.closed_loop import ClosedLoop
 from undertow.display.live import Message
-from undertow.law import ReachingLaw, SlidingModeLaw, Surface
+from undertow.law import ReachingLaw, ReferenceMotion, SlidingModeLaw, Surface
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import Objective
 from undertow.proofs import search_for
@@ -121,9 +122,10 @@ def maps_of(mechanism: Mechanism) -> Callable[[MapAsked], Message]:
     """Return what maps the phase plane of a mechanism: every cell is simulated to its end."""
 
     @lru_cache(maxsize=4)
-    def loop_for(task: Task) -> ClosedLoop:
+    def loop_for(task: Task) -> tuple[Cascade, ClosedLoop]:
         cascade = cascade_for(mechanism, task)
-        return ClosedLoop(cascade.mechanism, cascade.objective, cascade.reaching, step=cascade.step)
+        objective, law = cascade.objective, cascade.reaching
+        return cascade, ClosedLoop(cascade.mechanism, objective, law, step=cascade.step)
 
     def answer(asked: MapAsked) -> Message:
         n, (far, fast) = mechanism.n, asked.reach
@@ -133,7 +135,10 @@ def maps_of(mechanism: Mechanism) -> Callable[[MapAsked], Message]:
         starts[:, asked.axis] = np.tile(far * middle, SIDE) - asked.goal[asked.axis]
         starts[:, n + asked.axis] = np.repeat(fast * middle, SIDE)
         eta_and_layer = asked.reaching.vector(mechanism.m)[None, None, :]
-        batch = loop_for(asked.task).believing(believed).batch(
+        cascade, loop = loop_for(asked.task)
+        # The travel is not counted from the target.
+        goal = ReferenceMotion.at_rest(asked.goal) if asked.goal.any() else None
+        batch = cascade.about(loop.believing(believed), goal, 0.0).batch(
             starts, asked.surface.vector[None, None, :], reaching=eta_and_layer
         )  # fmt: skip
         law = SlidingModeLaw(believed, asked.surface, asked.reaching)
@@ -233,8 +238,9 @@ def _numbers(asked: MapAsked) -> FloatArray:
     far, fast = asked.reach
     n, scale = len(asked.goal), 1e3 / np.array([far, fast])
     x = asked.x * np.repeat(scale, n)
+    law = np.append(asked.surface.vector, asked.reaching.vector(asked.surface.m))
     own: Sequence[float] = (asked.axis, far, fast, *asked.task.limits, hash(asked.task) % 2**31)
-    return np.concatenate([own, np.rint(x), asked.goal, asked.parameters, asked.surface.vector])
+    return np.concatenate([own, np.rint(x), asked.goal, asked.parameters, law])
 
 
 def beside(mechanism: Mechanism) -> Beside:

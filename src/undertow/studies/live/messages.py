@@ -10,7 +10,7 @@ from undertow.base import InvalidInputError
 from undertow.closed_loop.figures import display
 from undertow.display.live import Message, Scene
 from undertow.estimators import Belief, ParameterEstimate
-from undertow.law import ReachingLaw, Surface
+from undertow.law import Plan, ReachingLaw
 from undertow.models import FloatArray, Mechanism
 
 
@@ -71,9 +71,13 @@ class ReadOnlyShow:
 
 
 def plan_message(
-    t: float, accepted: bool, why: str, surface: Surface, predicted: float, reaching: ReachingLaw
+    t: float, accepted: bool, why: str, plan: Plan, predicted: float, otherwise: ReachingLaw
 ) -> Message:
-    """Return a decision of the slow loop: the surface in use after it, and why it is that."""
+    """Return a decision of the slow loop: the plan in use after it, and why it is that.
+
+    ``otherwise`` is the reaching law of a plan that has none.
+    """
+    surface, reaching = plan.surfaces[0], plan.laws(otherwise)[0]
     return {
         "kind": "plan", "t": float(t), "accepted": accepted, "why": why,
         "predicted": float(predicted), "rows": surface.matrix.tolist(),

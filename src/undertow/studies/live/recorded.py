@@ -82,7 +82,7 @@ def of_run(
     for update in run.updates:
         admission = update.admission
         plan = plan_message(
-            update.t, admission.accepted, admission.reason, update.surface, update.predicted,
+            update.t, admission.accepted, admission.reason, update.plan, update.predicted,
             cascade.reaching,
         )  # fmt: skip
         plan |= {"ms": 1e3 * update.proposal.seconds, "first": update is run.updates[0],
@@ -171,7 +171,7 @@ class LoggedRun:
             self.scene = Scene(self.belief, figure)
             memory = memory_from(recording.meta["memory"], self._reference)
             self.first = plan_message(
-                0.0, True, "first optimum", memory.surface, memory.predicted, self._reaching
+                0.0, True, "first optimum", memory.plan, memory.predicted, self._reaching
             )
 
     def frames(self, steps: FloatArray) -> list[Message]:
@@ -191,7 +191,7 @@ class LoggedRun:
             answer = answer_from(row, self._reference)
             admission = answer.admission
             plan = plan_message(
-                answer.use, admission.accepted, admission.reason, answer.memory.surface,
+                answer.use, admission.accepted, admission.reason, answer.memory.plan,
                 answer.memory.predicted, self._reaching,
             )  # fmt: skip
             target = answer.memory.target

@@ -460,9 +460,11 @@ class Simulation:
         if self.memory is None:
             if answer.proposal.plan is None or answer.memory.plan is None or not answer.jump:
                 self._why = answer.proposal.message or answer.proposal.status
+                # The designed surface is better than none, or than one of before a reset.
+                self.law.use(self._idle.surface, self._cascade(job.task).reaching)
                 self._decide(answer, False, f"no surface from here: {self._why}")
                 self._anew = False
-                self.memory = self._idle  # the designed surface is better than none
+                self.memory = self._idle
                 self.mode = RUNNING
                 return
             if not job.target or not any(job.target.position(0.0)):
@@ -561,7 +563,7 @@ class Simulation:
             for place, name in places:
                 learnt[name] = float(values[place])
         reaching = self.law.reaching
-        message = plan_message(self.t, accepted, why, memory.surface, predicted, reaching)
+        message = plan_message(self.t, accepted, why, memory.plan, predicted, reaching)
         message |= {
             "ms": ms, "first": first, "learnt": learnt,
             "ghost": self.scene.places(self._goal, self._parameters).tolist(),

@@ -214,10 +214,13 @@ def summary(found: BringUp) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def handed_on(name: str, rig: str, found: BringUp) -> tuple[str, ...]:
+def handed_on(
+    name: str, rig: str, found: BringUp, given: Mapping[str, float] | None = None
+) -> tuple[str, ...]:
     """Return the command that runs a rig with what was identified, and what the driver is to do.
 
-    Empty where something is wrong, which is to be mended first, or nothing was identified.
+    Parameters that were ``given`` a value, SI units, keep it where none was identified. Empty where
+    something is wrong, which is to be mended first, or nothing was identified.
     """
     identified = found.identification
     if found.wrong or identified is None:
@@ -225,8 +228,10 @@ def handed_on(name: str, rig: str, found: BringUp) -> tuple[str, ...]:
     estimates, mechanism = identified.estimates, identified.mechanism
     words = ["undertow", "run", name, "--rig", rig]
     for parameter in mechanism.parameters:
-        if (one := estimates.get(parameter.name)) is not None:
-            words += ["--set", f"{parameter.name}={one.value:.5g}"]
+        one, known = estimates.get(parameter.name), (given or {}).get(parameter.name)
+        if one is not None or known is not None:
+            value = f"{known!r}" if one is None else f"{one.value:.5g}"
+            words += ["--set", f"{parameter.name}={value}"]
     if (late := estimates.get("delay")) is not None:
         words += ["--delay", f"{max(0.0, late.value):.2g}"]
     lines = [f"Run it with what was found: {shlex.join(words)}"]

@@ -59,15 +59,19 @@ def lqr(mechanism: Mechanism) -> MakeController:
 def nmpc(mechanism: Mechanism, objective: Objective, **settings: Any) -> MakeController:
     """Return nonlinear model-predictive control by multiple shooting at 10 Hz, to compare with.
 
+    It keeps within the limits of the inputs, and knows of no others: not of a travel either.
     ``settings`` are those of :class:`undertow.studies.trials.steering.NMPC`.
 
     Raises
     ------
     InvalidInputError
-        For an objective that does not rise with every input, such as least time.
+        For an objective that does not rise with every input, such as least time, and for one with
+        constraints of its own.
     MissingExtraError
         Without CasADi.
     """
+    own = ", ".join(c.name for c in objective.constraints if not c.declared)
+    require(not own, "constraints of an objective for NMPC", own, "none: it would not keep them")
     return predictive(mechanism, objective.on(mechanism), **settings)
 
 
@@ -203,6 +207,8 @@ def compare(
         named = _numbered([(_name(item), item) for item in named])
     for controller in named.values():
         _check_maker(controller)
+        if isinstance(controller, Cascade):
+            mechanism.check_plant(controller.mechanism)
     meets: Mapping[str, Bench | Mechanism]
     if isinstance(plants, Mapping):
         meets = plants

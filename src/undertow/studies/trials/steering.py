@@ -19,7 +19,7 @@ from undertow.base import InvalidInputError, require_extra
 from undertow.bounds.expressions import dynamics
 from undertow.cascade import Cascade, CascadeState
 from undertow.estimators import Estimator, StateFeedback
-from undertow.law import InnerLoop, Plan, ReachingLaw, Surface
+from undertow.law import InnerLoop, Plan, ReachingLaw, Surface, usual_reaching
 from undertow.models import (
     UNCONTROLLABLE,
     FloatArray,
@@ -38,16 +38,20 @@ from undertow.studies.trials.trial import MakeController
 
 
 def keeping(
-    mechanism: Mechanism, kept: Surface | Plan, reaching: ReachingLaw = ReachingLaw()
+    mechanism: Mechanism, kept: Surface | Plan, reaching: ReachingLaw | None = None
 ) -> MakeController:
-    """Return the maker of a controller that keeps one surface, or one plan with its own laws."""
+    """Return the maker of a controller that keeps one surface, or one plan with its own laws.
+
+    A surface that has none is reached by ``reaching``, the usual law by default.
+    """
     plan = kept if isinstance(kept, Plan) else Plan.of(kept)
+    otherwise = reaching or usual_reaching(mechanism, plan.surfaces[0])
 
     def make(_start: FloatArray) -> StateFeedback:
-        law = InnerLoop(mechanism, plan.surfaces[0], reaching)
+        law = InnerLoop(mechanism, plan.surfaces[0], otherwise)
 
         def control(t: float, x: FloatArray) -> FloatArray:
-            law.follow(plan, t, reaching)
+            law.follow(plan, t, otherwise)
             return law(x)
 
         return control
