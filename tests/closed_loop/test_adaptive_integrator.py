@@ -18,6 +18,7 @@ from support import derivative, interpreted
 from undertow.base import InvalidInputError
 from undertow.closed_loop import Event
 from undertow.closed_loop.adaptive_integrator import BETWEEN, ERROR, LEAST, STAGES, WHEN
+from undertow.closed_loop.buffers import RolloutBuffers
 from undertow.law import Plan
 from undertow.mechanisms import LIBRARY
 from undertow.models import FloatArray
@@ -357,6 +358,18 @@ def test_no_step_is_shorter_than_a_part_of_the_loops(rig: ut.Mechanism) -> None:
     run = loop.batch(rig.state(phi=0.4), PASSING, duration=0.004, terminal=0.0, precise=True)
     assert run.time == 0.004
     assert run.steps[0] <= 2 / LEAST + 16  # two steps of the loop, and what was tried at first
+
+
+def test_what_noise_costs_is_counted_of_motions_alone(rig: ut.Mechanism) -> None:
+    """Lanes that stand for none hold what was in memory before: no warning comes of them."""
+    loop, x = ut.ClosedLoop(rig, covariance=1e-8 * np.eye(4)), rig.state(phi=0.1)
+    buffers = RolloutBuffers(loop, 1, 1).fill(x, PASSING.vector)
+    buffers.out[:, 0], buffers.out[:, 1] = -math.inf, math.inf
+    with np.errstate(invalid="raise"):
+        motion = loop.roll_out(buffers, (0.0,), 0.1, precise=True)
+    alone = loop.batch(x, PASSING, duration=0.1, precise=True)
+    quiet = ut.ClosedLoop(rig).batch(x, PASSING, duration=0.1, precise=True)
+    assert motion.cost[0] == alone.cost[0] > quiet.cost[0]
 
 
 @pytest.mark.parametrize(

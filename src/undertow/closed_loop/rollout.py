@@ -520,8 +520,9 @@ class ClosedLoop:
         assert self.linear_end is not None
         assert buffers.ends is not None
         assert self.covariance is not None
-        rate = self.linear_end.noise_cost(buffers.ends, self.covariance)
-        buffers.out[:, 0] += NEAR * rate * (buffers.out[:, 1] - start)
+        rate = self.linear_end.noise_cost(buffers.ends, self.covariance)[: buffers.count]
+        out = buffers.out[: buffers.count]  # the others may never have been filled
+        out[:, 0] += NEAR * rate * (out[:, 1] - start)
 
     @cached_property
     def prices(self) -> FloatArray:
