@@ -242,8 +242,8 @@ def run(
     processes
         For the optimiser; 0: a thread.
     settings
-        Limits and timeouts of the run; by default a plan is asked for the cascade's period ahead,
-        ``Settings(lead_time=cascade.period)``: one follows another, so that is how often.
+        Limits and timeouts of the run; by default ``Settings(lead_time=cascade.period)``: each plan
+        is asked for one period ahead, and the next one when it is there, so once in every period.
     target
         Where to, x = 0 by default: coordinates to positions, or :class:`undertow.SetPoints` that
         jump at times since the start of the run, each as soon as there is a plan for it; or a

@@ -18,8 +18,8 @@ class Settings:
     Parameters
     ----------
     output_limit
-        Largest |u|, in the input's unit; the mechanism's own limits apply besides.  Plans are made
-        with what is left.
+        Largest |u|, in the input's unit; the mechanism's own limits apply besides.  Plans keep to
+        the smaller of the two.
     slew_time
         Shortest time in which an input may cross its whole range, s: the slew rate is
         2 u_max / slew_time.  Inputs without a limit have none on their rate either.
