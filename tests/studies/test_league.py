@@ -24,7 +24,7 @@ from undertow.runtime import estimator_for
 from undertow.studies.campaign import Campaign, Definition, compute, dataset, executor_for
 from undertow.studies.campaign.definition import Settings
 from undertow.studies.campaign.entrants import FAULTS, ForfeitError, Refereed, steered
-from undertow.studies.campaign.league import TASKS, League, home
+from undertow.studies.campaign.league import TASKS, VERSION, League, home
 from undertow.studies.campaign.league_report import median_interval, tables, wilson
 from undertow.studies.campaign.report import alone
 from undertow.studies.campaign.run import study_of
@@ -376,6 +376,7 @@ def test_a_run_that_ends_before_the_push_is_refused(file: Path) -> None:
 def test_the_page_says_how_to_enter(tmp_path: Path) -> None:
     """The controller of docs/league.md, entered as it says, in at most 30 lines."""
     page = (Path(__file__).parents[2] / "docs" / "league.md").read_text(encoding="utf-8")
+    assert f"a fixed benchmark, version {VERSION}," in page
     code = re.search(r"```python\n(.*?)```", page, re.S)
     assert code is not None
     assert code[1].count("\n") <= 30

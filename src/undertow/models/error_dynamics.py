@@ -49,10 +49,11 @@ def _drops_out(
     force: sp.ImmutableDenseMatrix,
     potential: sp.Expr | None,
     q: tuple[sp.Symbol, ...],
-) -> list[bool]:
+) -> tuple[bool, ...]:
     """For each coordinate whether it drops out of equations, which many mechanisms share."""
     slopes = [] if potential is None else [sp.diff(potential, symbol) for symbol in q]
-    return [all(_independent(e, symbol) for e in [*mass, *force, *slopes]) for symbol in q]
+    entries = [*mass, *force, *slopes]
+    return tuple(all(_independent(entry, symbol) for entry in entries) for symbol in q)
 
 
 def _independent(entry: sp.Expr, symbol: sp.Symbol) -> bool:
