@@ -10,7 +10,7 @@ import numpy as np
 
 from undertow.base import InvalidInputError, a_kind
 from undertow.cascade.predictions import Predictions, costs_along
-from undertow.cascade.reserve import Reserve
+from undertow.cascade.reserve import Reserve, stiffer
 from undertow.cascade.robustness import sticking_distance
 from undertow.cascade.state import CascadeState, as_numbers
 from undertow.closed_loop import INADMISSIBLE, ClosedLoop, Event
@@ -85,7 +85,8 @@ class Judge:
         sticks = self._sticks(state, loop, plan) > 0
         if not sticks and self.mendable(state, loop, plan, error, soon):
             return plan
-        better = self.reserve.better(loop, plan, error, span, sticks)
+        stiffer = self._stiffer(state, loop, plan) if sticks else ()
+        better = self.reserve.better(loop, plan, error, span, sticks, stiffer)
         if better is None:
             return plan
         asked = sticks or self.recourse  # with recourse it was asked above
@@ -186,6 +187,10 @@ class Judge:
         most = f"{self.objective.terminal_radius:g} at most"
         return f"a joint that sticks is freed by {off:.3g} of the others, {most}"
 
+    def frees(self, state: CascadeState, loop: ClosedLoop, plan: Plan) -> bool:
+        """Whether no joint sticks farther off with a plan than with the one in use."""
+        return not self._frees_too_late(state, loop, plan)
+
     def _breaks_sooner(self, state: CascadeState, new: Plan, error: FloatArray, span: float) -> str:
         """Say so where a plan breaks a constraint on the estimate before the one in use does."""
         (before, _), (end, name) = self.breaks(state, [state.plan, new], error, span)
@@ -215,6 +220,11 @@ class Judge:
         size = np.array(state.disturbance)
         off = sticking_distance(loop.mechanism, plan.surfaces[-1], size, law)
         return off if off > self.objective.terminal_radius else 0.0
+
+    def _stiffer(self, state: CascadeState, loop: ClosedLoop, plan: Plan) -> tuple[Plan, ...]:
+        """The plan itself, its surfaces reached sooner, as far as no joint sticks with it."""
+        plans = stiffer(plan, self.reaching)
+        return tuple(one for one in plans if not self._sticks(state, loop, one))
 
     def ask(self, loop: ClosedLoop, old: Plan, new: Plan, x: FloatArray, span: float) -> Admission:
         """What the gate says of a plan, in the place of an old one."""

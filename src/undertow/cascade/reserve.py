@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import lru_cache
 
@@ -41,6 +42,25 @@ def ever_stronger(plan: Plan, reaching: ReachingLaw) -> tuple[Plan, ...]:
     )
 
 
+def stiffer(plan: Plan, reaching: ReachingLaw) -> tuple[Plan, ...]:
+    """Return a plan with ever thinner layers, down to those of ``reaching`` for its gains."""
+    if plan.reaching is None:
+        return ()
+    m = plan.surfaces[0].m
+    eta, layer = reaching.per_surface(m)
+    plans, rates = [], eta / layer
+    for k in range(1, 1 + math.ceil(math.log2(max(1.0, float(rates.max()))))):
+        laws = []
+        for law in plan.reaching:
+            own, wide = law.per_surface(m)
+            thin = own / np.maximum(np.minimum(own / wide * 2.0**k, rates), own / wide)
+            laws.append(replace(law, eta=tuple(own.tolist()), layer=tuple(thin.tolist())))
+        if plans and tuple(laws) == plans[-1].reaching:
+            break
+        plans.append(replace(plan, reaching=tuple(laws)))
+    return tuple(plans)
+
+
 class Reserve:
     """The first surface, reached ever more strongly.
 
@@ -63,25 +83,28 @@ class Reserve:
         self._better = lru_cache(maxsize=2)(self._compare)
 
     def better(
-        self, loop: ClosedLoop, plan: Plan, error: FloatArray, span: float, sticks: bool
-    ) -> Plan | None:
+        self, loop: ClosedLoop, plan: Plan, error: FloatArray, span: float, sticks: bool,
+        others: tuple[Plan, ...] = (),
+    ) -> Plan | None:  # fmt: skip
         """The plan that is better than one in use, which may stick; ``None``: none is.
 
         A decision asks twice, for the search and for the gate: the latest answers are kept.
         """
-        return self._better(loop, plan, error.tobytes(), span, sticks)
+        return self._better(loop, plan, error.tobytes(), span, sticks, others)
 
     def _compare(
-        self, loop: ClosedLoop, plan: Plan, error: bytes, span: float, sticks: bool
-    ) -> Plan | None:
+        self, loop: ClosedLoop, plan: Plan, error: bytes, span: float, sticks: bool,
+        others: tuple[Plan, ...],
+    ) -> Plan | None:  # fmt: skip
         x = np.frombuffer(error).reshape(-1, 2 * loop.mechanism.n)
         if not sticks and loop.batch(x, plan, duration=span).score(span)[0] < INADMISSIBLE:
             return None
-        scores = loop.batch(x, [plan, *self.plans], duration=span).score(span)
+        plans = [plan, *others, *self.plans]
+        scores = loop.batch(x, plans, duration=span).score(span)
         ranks = [(score >= INADMISSIBLE, False, score) for score in scores]
         ranks[0] = (scores[0] >= INADMISSIBLE, sticks, scores[0])
         best = min(range(len(ranks)), key=ranks.__getitem__)
-        return self.plans[best - 1] if best else None
+        return plans[best] if best else None
 
     def after_jump(self, loop: ClosedLoop, first: Plan, error: FloatArray) -> Plan:
         """The plan to go on with when velocities have jumped: one of these, or the first optimum.

@@ -157,7 +157,7 @@ def sticking_distance(
     taken off for it before adds to it: until k_u q_u is more than both the joint stands, and the
     free ones fall.  ‖q_u‖ = 2 |d_i| / ‖k_u,i‖ for the input i, rad or m; of several inputs the
     largest.  A soft law sways so far from side to side for ever, however well it does without
-    friction.
+    friction.  0 where the free joints do not fall while the driven ones stand, as a load that hangs.
 
     Parameters
     ----------
@@ -182,12 +182,23 @@ def sticking_distance(
             value=disturbance,
             limit=f"{mechanism.m} finite numbers, one for each input",
         )
-    if not sizes.any():
+    if not sizes.any() or not _falls(mechanism):
         return 0.0
     k = feedback_at_target(mechanism, surface, reaching)
     gains = np.linalg.norm(k[:, mechanism.m : mechanism.n], axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         return float(np.where(sizes > 0, 2.0 * sizes / gains, 0.0).max())
+
+
+@lru_cache(maxsize=32)
+def _falls(mechanism: Mechanism) -> bool:
+    """Whether free joints leave the target while the driven ones stand."""
+    lin, n, m = linearise(mechanism), mechanism.n, mechanism.m
+    A, B = lin.A[n:], lin.input[n:]
+    held = A[m:] - B[m:] @ np.linalg.solve(B[:m], A[:m])  # what holds the driven ones moves these
+    free = np.r_[m:n, n + m : 2 * n]
+    block = np.vstack([np.eye(2 * (n - m))[n - m :], held[:, free]])
+    return bool(np.linalg.eigvals(block).real.max() > 1e-9)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@
 commands know by name.
 """
 
-from undertow.objective.named import USUAL, Goal, finite_limits, objective_for
+from undertow.objective.named import ERROR_PRICE, USUAL, Goal, finite_limits, objective_for
 from undertow.objective.objective import (
     TRAVEL,
     Constraint,
@@ -17,6 +17,7 @@ from undertow.objective.objective import (
 
 __all__ = [
     "TRAVEL",
+    "ERROR_PRICE",
     "USUAL",
     "Constraint",
     "Goal",

@@ -3,7 +3,8 @@
 Surface entries are searched in symmetric-logarithmic coordinates z with p = w sinh z, entry
 by entry, around a first surface: entries may change sign, and small and large values are
 resolved alike.  Reaching gains are searched as ln η, and the boundary layer through the
-rate η/ε, kept between 1/s and what the integration step can bear.
+rate η/ε, kept between 1/s and what the integration step can bear; where the rate alone is
+free, as its logarithm, up to that of the reaching law.
 """
 
 from __future__ import annotations
@@ -18,8 +19,14 @@ from undertow.base import InvalidInputError, check_fields, positive, require
 from undertow.closed_loop import ClosedLoop, RolloutBuffers
 from undertow.closed_loop.trajectory import Batch
 from undertow.law import LawLayout, Plan, ReachingLaw, Surface, rising_from_zero
-from undertow.models import FloatArray
+from undertow.models import FloatArray, Mechanism, ModelError
 from undertow.symbolic import compiled
+
+
+#: Slowest rate η/ε at which a surface is reached, 1/s, where the rate alone is free; and how many
+#: times as fast as what leaves the target by itself it is at least: a slower law bears little that
+#: the model does not know.
+SLOWEST, FASTER = 1.0, 2.0
 
 
 @dataclass(frozen=True)
@@ -34,6 +41,10 @@ class DecisionVariables:
         Times at which further surfaces take over, s; the first is 0: a schedule.
     alpha_a
         Also the off-diagonal entries of α_a (m > 1); its diagonal stays −1.
+    rate
+        Of the reaching law the rates η_i/ε_i alone, at most those of the given law, whose gains η_i
+        stay: near the target it may be gentler then, and far from it is as strong as ever.  ``None``:
+        where :func:`undertow.runtime.for_rig` finds that it pays.
     schedule
         Surfaces one after another, with their reaching laws.  For least time each for so long, s,
         and as many as the motion needs; for another cost five, the first for so long or longer,
@@ -42,13 +53,15 @@ class DecisionVariables:
     Raises
     ------
     InvalidInputError
-        For times that do not rise from 0, and a schedule without free reaching laws or with times.
+        For times that do not rise from 0, a schedule without free reaching laws or with times, and
+        rates besides reaching laws.
     """
 
     reaching: bool = False
     times: tuple[float, ...] = (0.0,)
     alpha_a: bool = False
     schedule: float = 0.0
+    rate: bool | None = None
 
     def __post_init__(self) -> None:
         """Refuse times that do not rise from 0, and a schedule of fixed gains."""
@@ -61,20 +74,38 @@ class DecisionVariables:
                 limit="free reaching laws, no other times",
                 remedy="Write DecisionVariables(reaching=True, schedule=0.1)",
             )
+        if self.rate and self.reaching:
+            raise InvalidInputError(
+                "decision variables",
+                value="reaching=True, rate=True",
+                limit="one of them: a free reaching law has its own rate",
+            )
         rising = rising_from_zero(self.times)
         require(rising, "times of a schedule", self.times, "rising times from 0 s")
 
     @property
     def plainer(self) -> DecisionVariables | None:
-        """A set that this one contains: one surface, then plain reaching, then plain α_a.
+        """A set that this one contains: one surface, then the given law, then plain α_a.
 
         ``None`` for the paper's three parameters.
         """
         if self.schedule or len(self.times) > 1:
             return replace(self, schedule=0.0, times=(0.0,))
-        if self.reaching:
-            return replace(self, reaching=False)
+        if self.reaching or self.rate:
+            return replace(self, reaching=False, rate=False)
         return replace(self, alpha_a=False) if self.alpha_a else None
+
+
+def slowest_rate(mechanism: Mechanism) -> float:
+    """The slowest rate η/ε at which a surface of a mechanism may be reached, 1/s.
+
+    ``FASTER`` times that of the fastest motion that leaves the target by itself.
+    """
+    try:
+        growth = np.linalg.eigvals(mechanism.linearise().A).real.max()
+    except ModelError:  # without a linear model nothing is known of it
+        growth = 0.0
+    return max(SLOWEST, FASTER * float(growth))
 
 
 class SearchSpace:
@@ -98,6 +129,9 @@ class SearchSpace:
         self._places = np.flatnonzero(self._free)
         # Runge-Kutta is stable up to a rate of 2.8/step; the law is resolved up to 0.8/step.
         self._fastest = 0.8 / (loop.step * max(1, loop.zoh_steps))
+        eta, layer = loop.reaching.per_surface(m)
+        self._eta, self._highest = eta, eta / layer
+        self._lowest = np.minimum(slowest_rate(loop.mechanism), self._highest)
 
     def at(self, times: tuple[float, ...]) -> SearchSpace:
         """Return the coordinates of the same kind for surfaces that take over at these times, s."""
@@ -116,7 +150,12 @@ class SearchSpace:
     @property
     def size(self) -> int:
         """Dimension of z."""
-        return self.segments * (self._entries + 2 * self.m * self.freedom.reaching)
+        return self.segments * (self._entries + self.m * self._per_input)
+
+    @property
+    def _per_input(self) -> int:
+        """Numbers of the reaching law that are free, for each input."""
+        return 2 if self.freedom.reaching else int(bool(self.freedom.rate))
 
     def steps(self, rng: np.random.Generator, spread: FloatArray) -> FloatArray:
         """Draw steps in z, (N, d), of standard deviations ``spread``, (N,).
@@ -139,6 +178,9 @@ class SearchSpace:
                 eta, layer = (law or self.loop.reaching).per_surface(self.m)
                 part = np.clip((eta / layer - 1.0) / (self._fastest - 1.0), 1e-6, 1 - 1e-6)
                 parts += [np.log(eta), np.log(part / (1 - part))]
+            elif self.freedom.rate:
+                eta, layer = (law or self.loop.reaching).per_surface(self.m)
+                parts.append(np.log(np.clip(eta / layer, self._lowest, self._highest)))
         return np.concatenate(parts)
 
     def decode(self, z: FloatArray) -> tuple[FloatArray, FloatArray | None]:
@@ -147,7 +189,11 @@ class SearchSpace:
         vectors = np.empty((len(z), self.segments, 2 * self.m * self.n))
         gains = np.empty((len(z), self.segments, 2 * self.m * self.freedom.reaching))
         _decode(rows, self._base, self._places, self._width, self._fastest, vectors, gains)
-        return vectors, gains if self.freedom.reaching else None
+        if self.freedom.rate:
+            low, high = np.log(self._lowest), np.log(self._highest)
+            layer = self._eta / np.exp(np.clip(rows[:, :, self._entries :], low, high))
+            gains = np.concatenate([np.broadcast_to(self._eta, layer.shape), layer], axis=2)
+        return vectors, gains if self._per_input else None
 
     def plan(self, z: FloatArray) -> Plan:
         """Return the plan at some coordinates, (d,)."""
