@@ -9,7 +9,7 @@ import numpy as np
 
 from undertow.closed_loop import INADMISSIBLE, ClosedLoop
 from undertow.law import Plan, ReachingLaw, Surface
-from undertow.models import FloatArray
+from undertow.models import FloatArray, Mechanism
 
 #: How many times the reaching gains and layers of the plans in reserve are the cascade's: near the
 #: target all are the same feedback, far from it each asks for more input before it saturates.
@@ -33,12 +33,27 @@ def ever_stronger(plan: Plan, reaching: ReachingLaw) -> tuple[Plan, ...]:
         replace(
             plan,
             reaching=tuple(
-                replace(law, eta=tuple(c * eta), layer=tuple(c * layer))
+                replace(law, eta=tuple((c * eta).tolist()), layer=tuple((c * layer).tolist()))
                 for law, eta, layer in gains
             ),
         )
         for c in STRONGER
     )
+
+
+@lru_cache(maxsize=32)
+def _knocks(mechanism: Mechanism) -> FloatArray:
+    """Velocities after an impulse on each coordinate that gives it 1 m/s or rad/s, by row."""
+    inverse = np.linalg.inv(mechanism.M(np.zeros(mechanism.n)))
+    return np.asarray((inverse / np.diag(inverse)).T)
+
+
+def speed_of(mechanism: Mechanism, velocities: FloatArray) -> float:
+    """The speed of the fastest coordinate after the impulses that velocities, (n,), come from.
+
+    Of each impulse alone, at the target, m/s or rad/s.
+    """
+    return float(np.abs(np.linalg.solve(_knocks(mechanism).T, velocities)).max())
 
 
 class Reserve:
@@ -83,29 +98,36 @@ class Reserve:
         best = min(range(len(ranks)), key=ranks.__getitem__)
         return self.plans[best - 1] if best else None
 
-    def after_jump(self, loop: ClosedLoop, first: Plan, error: FloatArray) -> Plan:
-        """The plan to go on with when velocities have jumped: one of these, or the first optimum.
+    def after_jump(
+        self, loop: ClosedLoop, first: Plan, error: FloatArray
+    ) -> tuple[tuple[float, Plan], ...]:
+        """The plans to go on with when velocities have jumped, and up to which speed each does.
 
-        That, too, may be reached more strongly.  It is the one that brings home from most of the
-        ``JUMPS`` at rest, and of those the cheapest in sum.  The plan in use is none of them: at
-        rest that was chosen for hardly any cost, and what it does elsewhere nobody asked.
+        One of these, or the first optimum, which may be reached more strongly, too: of those that
+        bring home from most of the ``JUMPS`` at rest up to the next larger one, the cheapest for
+        its own.  The plan in use is none of them: at rest that was chosen for hardly any cost, and
+        what it does elsewhere nobody asked.  Speeds are those of :func:`speed_of`.
         """
         mechanism, n = loop.mechanism, loop.mechanism.n
         far = float(np.abs(error[:n]).max())
         if not far > 0:
-            return self.plans[-1]
-        inverse = np.linalg.inv(mechanism.M(np.zeros(n)))
-        jump = mechanism.linearise().fastest * far * (inverse / np.diag(inverse)).T
-        knocks = np.zeros((2 * len(JUMPS) * n, 2 * n))
-        knocks[:, n:] = np.vstack([sign * part * jump for part in JUMPS for sign in (1, -1)])
+            return ()
+        speeds = mechanism.linearise().fastest * far * np.array(JUMPS)
+        knock = _knocks(mechanism)
+        knocks = np.zeros((len(JUMPS), 2 * n, 2 * n))
+        knocks[:, :, n:] = speeds[:, None, None] * np.vstack([knock, -knock])
         plans = [*reversed(self.plans), *ever_stronger(first, self.reaching)]
-        span = loop.objective.horizon
-        ranks = []
-        for plan in plans:
-            scores = loop.batch(knocks, plan).score(span)
-            lost = scores >= INADMISSIBLE
-            ranks.append((int(lost.sum()), float(scores[~lost].sum())))
-        return plans[min(range(len(plans)), key=ranks.__getitem__)]
+        span, shape = loop.objective.horizon, (len(plans), len(JUMPS), 2 * n)
+        scores = [loop.batch(knocks.reshape(-1, 2 * n), plan).score(span) for plan in plans]
+        costs = np.reshape(scores, shape)
+        lost = costs >= INADMISSIBLE
+        chosen = []
+        for k, speed in enumerate(speeds.tolist()):
+            missed = lost[:, : k + 2].sum(axis=(1, 2))
+            cost = np.where(lost[:, k], 0.0, costs[:, k]).sum(axis=1)
+            best = min(range(len(plans)), key=lambda i: (missed[i], cost[i]))
+            chosen.append((speed, plans[best]))
+        return tuple(chosen)
 
     def recovers(self, loop: ClosedLoop, error: FloatArray, span: float, plan: Plan) -> bool:
         """Whether a plan may be in use as far as every plausible plant is concerned.
