@@ -138,7 +138,29 @@ def test_what_takes_over_after_a_jump_keeps_within_the_travel_about_a_target_too
         target = ReferenceMotion.at_rest(np.array([to, 0.0])) if to else None
         state = replace(begun, target=target)
         chosen.append(cascade.prepared(state, cart.state(x=x, phi=0.1)).after_jump)
-    assert chosen[0] == chosen[1]
+    (slow, plans), (fast, others) = (zip(*some, strict=True) for some in chosen)
+    assert plans == others
+    assert slow == pytest.approx(fast, rel=1e-12)
+
+
+def test_what_takes_over_after_a_jump_is_chosen_by_its_size() -> None:
+    """A small push is not met as a large one is: the cart would spend its whole input on it."""
+    cart = ut.mechanisms.cart_pendulum()
+    cascade = ut.Cascade(cart, ut.objective_for(cart, "effort"))
+    x = cart.usual_start
+    state, _ = cascade.start(x)
+    assert cascade.after_jump(state, x) == cascade.reserve[-1]  # nothing was asked for before
+    state = cascade.prepared(state, x)
+    speeds, plans = zip(*state.after_jump, strict=True)
+    assert list(speeds) == sorted(speeds)
+    p = np.linalg.inv(cart.M(np.zeros(2)))[:, 1]  # by an impulse on the pendulum
+    knock = np.concatenate([np.zeros(2), p / p[1]])
+    for speed, plan in state.after_jump:
+        assert cascade.after_jump(state, -0.99 * speed * knock) == plan
+    assert cascade.after_jump(state, 2 * speeds[-1] * knock) == plans[-1]
+    loop = cascade.loop_at(state)
+    small = loop.batch(speeds[0] * knock, list(plans)).score(loop.objective.horizon)
+    assert small[0] == small.min() < 0.9 * small[-1]
 
 
 def test_the_pieces_of_a_run_leave_no_gap() -> None:

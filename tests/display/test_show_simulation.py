@@ -222,16 +222,12 @@ def test_a_push_is_an_impulse_and_is_recovered_from(simulation: Simulation) -> N
     simulation.hear({"do": "push", "side": 1}, 1)
     simulation._step()
     assert simulation.rig.truth[3] - before[3] == pytest.approx(0.7, abs=0.1)
+    memory, error = simulation.memory, simulation._error(simulation.rig.truth)
+    assert memory is not None
+    chosen = simulation._cascade(simulation.controls.task).after_jump(memory, error)
     reserve, *decided = plans(go(simulation, 2.0))
     assert reserve["why"] == "a plan in reserve: the velocities have jumped"
-    assert simulation.memory is not None
-    assert (
-        reserve["rows"]
-        == simulation._cascade(simulation.controls.task)
-        .after_jump(simulation.memory)
-        .surfaces[0]
-        .matrix.tolist()
-    )
+    assert reserve["rows"] == chosen.surfaces[0].matrix.tolist()
     assert decided[0]["t"] < t + 0.3
     assert simulation.mode == "running"
     assert abs(simulation.rig.truth[1]) < 0.05

@@ -29,7 +29,7 @@ from undertow.cascade.judge import Judge
 from undertow.cascade.planners import Planners, searched
 from undertow.cascade.planning import Planning
 from undertow.cascade.predictions import Predictions
-from undertow.cascade.reserve import Reserve
+from undertow.cascade.reserve import Reserve, speed_of
 from undertow.cascade.simulation import (
     Run,
     Update,
@@ -311,6 +311,8 @@ class Cascade:
     def prepared(self, state: CascadeState, x: ArrayLike) -> CascadeState:
         """Choose what takes over when velocities jump, by rollouts; return it with the memory.
 
+        One plan for each of some speeds to which they may jump.
+
         Candidates are the plan in use, then the first optimum from x, (2n,), and those of
         :attr:`reserve`, both reached ever more strongly.  Who steers a plant that may be pushed
         asks for it once, before the run.
@@ -322,9 +324,16 @@ class Cascade:
         return replace(state, after_jump=self._reserve.after_jump(loop, state.plan, error))
 
     @checked
-    def after_jump(self, state: CascadeState) -> Plan:
-        """Return the plan that takes over when velocities jump, see :meth:`prepared`."""
-        return state.after_jump or self.reserve[-1]
+    def after_jump(self, state: CascadeState, error: FloatArray) -> Plan:
+        """Return the plan that takes over when velocities have jumped, see :meth:`prepared`.
+
+        ``error`` is how far the state is off the target since, (2n,).
+        """
+        if not state.after_jump:
+            return self.reserve[-1]
+        speed = speed_of(self.mechanism, error[self.mechanism.n :])
+        slower = (plan for most, plan in state.after_jump if speed <= most)
+        return next(slower, state.after_jump[-1][1])
 
     @cached_property
     def _judge(self) -> Judge:

@@ -159,7 +159,7 @@ class Planning:
             costs = costs_along(whole, x, plans, target, t, horizon)
             k = int(np.argmin(costs))
             plan, cost = plans[k], costs[k]
-        kept = None if before is None else before.after_jump
+        kept = () if before is None else before.after_jump
         begun = CascadeState(
             plan, number, cost, cost, t, as_numbers(x), known, target, after_jump=kept
         )

@@ -10,7 +10,7 @@ import numpy as np
 
 from undertow.closed_loop import INADMISSIBLE, ClosedLoop
 from undertow.law import Plan, ReachingLaw, Surface
-from undertow.models import FloatArray
+from undertow.models import FloatArray, Mechanism
 
 #: How many times the reaching gains and layers of the plans in reserve are the cascade's: near the
 #: target all are the same feedback, far from it each asks for more input before it saturates.
@@ -34,7 +34,7 @@ def ever_stronger(plan: Plan, reaching: ReachingLaw) -> tuple[Plan, ...]:
         replace(
             plan,
             reaching=tuple(
-                replace(law, eta=tuple(c * eta), layer=tuple(c * layer))
+                replace(law, eta=tuple((c * eta).tolist()), layer=tuple((c * layer).tolist()))
                 for law, eta, layer in gains
             ),
         )
@@ -43,22 +43,39 @@ def ever_stronger(plan: Plan, reaching: ReachingLaw) -> tuple[Plan, ...]:
 
 
 def stiffer(plan: Plan, reaching: ReachingLaw) -> tuple[Plan, ...]:
-    """Return a plan with ever thinner layers, down to those of ``reaching`` for its gains."""
-    if plan.reaching is None:
-        return ()
+    """Return a plan reached twice as fast, and so on up to the rates η/ε of ``reaching``."""
     m = plan.surfaces[0].m
     eta, layer = reaching.per_surface(m)
-    plans, rates = [], eta / layer
-    for k in range(1, 1 + math.ceil(math.log2(max(1.0, float(rates.max()))))):
-        laws = []
-        for law in plan.reaching:
-            own, wide = law.per_surface(m)
-            thin = own / np.maximum(np.minimum(own / wide * 2.0**k, rates), own / wide)
-            laws.append(replace(law, eta=tuple(own.tolist()), layer=tuple(thin.tolist())))
-        if plans and tuple(laws) == plans[-1].reaching:
-            break
-        plans.append(replace(plan, reaching=tuple(laws)))
+    laws = [(law, *law.per_surface(m)) for law in plan.laws(reaching)]
+    most = max(float((eta / layer * wide / own).max()) for _, own, wide in laws)
+    plans = []
+    for k in range(1, 1 + math.ceil(math.log2(max(1.0, most)))):
+        thin = [
+            np.maximum(wide / 2.0**k, np.minimum(wide, own * layer / eta)) for _, own, wide in laws
+        ]
+        faster = zip(laws, thin, strict=True)
+        plans.append(
+            replace(
+                plan,
+                reaching=tuple(replace(law, layer=tuple(e.tolist())) for (law, _, _), e in faster),
+            )
+        )
     return tuple(plans)
+
+
+@lru_cache(maxsize=32)
+def _knocks(mechanism: Mechanism) -> FloatArray:
+    """Velocities after an impulse on each coordinate that gives it 1 m/s or rad/s, by row."""
+    inverse = np.linalg.inv(mechanism.M(np.zeros(mechanism.n)))
+    return np.asarray((inverse / np.diag(inverse)).T)
+
+
+def speed_of(mechanism: Mechanism, velocities: FloatArray) -> float:
+    """The speed of the fastest coordinate after the impulses that velocities, (n,), come from.
+
+    Of each impulse alone, at the target, m/s or rad/s.
+    """
+    return float(np.abs(np.linalg.solve(_knocks(mechanism).T, velocities)).max())
 
 
 class Reserve:
@@ -106,29 +123,36 @@ class Reserve:
         best = min(range(len(ranks)), key=ranks.__getitem__)
         return plans[best] if best else None
 
-    def after_jump(self, loop: ClosedLoop, first: Plan, error: FloatArray) -> Plan:
-        """The plan to go on with when velocities have jumped: one of these, or the first optimum.
+    def after_jump(
+        self, loop: ClosedLoop, first: Plan, error: FloatArray
+    ) -> tuple[tuple[float, Plan], ...]:
+        """The plans to go on with when velocities have jumped, and up to which speed each does.
 
-        That, too, may be reached more strongly.  It is the one that brings home from most of the
-        ``JUMPS`` at rest, and of those the cheapest in sum.  The plan in use is none of them: at
-        rest that was chosen for hardly any cost, and what it does elsewhere nobody asked.
+        One of these, or the first optimum, which may be reached more strongly, too: of those that
+        bring home from most of the ``JUMPS`` at rest up to the next larger one, the cheapest for
+        its own.  The plan in use is none of them: at rest that was chosen for hardly any cost, and
+        what it does elsewhere nobody asked.  Speeds are those of :func:`speed_of`.
         """
         mechanism, n = loop.mechanism, loop.mechanism.n
         far = float(np.abs(error[:n]).max())
         if not far > 0:
-            return self.plans[-1]
-        inverse = np.linalg.inv(mechanism.M(np.zeros(n)))
-        jump = mechanism.linearise().fastest * far * (inverse / np.diag(inverse)).T
-        knocks = np.zeros((2 * len(JUMPS) * n, 2 * n))
-        knocks[:, n:] = np.vstack([sign * part * jump for part in JUMPS for sign in (1, -1)])
+            return ()
+        speeds = mechanism.linearise().fastest * far * np.array(JUMPS)
+        knock = _knocks(mechanism)
+        knocks = np.zeros((len(JUMPS), 2 * n, 2 * n))
+        knocks[:, :, n:] = speeds[:, None, None] * np.vstack([knock, -knock])
         plans = [*reversed(self.plans), *ever_stronger(first, self.reaching)]
-        span = loop.objective.horizon
-        ranks = []
-        for plan in plans:
-            scores = loop.batch(knocks, plan).score(span)
-            lost = scores >= INADMISSIBLE
-            ranks.append((int(lost.sum()), float(scores[~lost].sum())))
-        return plans[min(range(len(plans)), key=ranks.__getitem__)]
+        span, shape = loop.objective.horizon, (len(plans), len(JUMPS), 2 * n)
+        scores = [loop.batch(knocks.reshape(-1, 2 * n), plan).score(span) for plan in plans]
+        costs = np.reshape(scores, shape)
+        lost = costs >= INADMISSIBLE
+        chosen = []
+        for k, speed in enumerate(speeds.tolist()):
+            missed = lost[:, : k + 2].sum(axis=(1, 2))
+            cost = np.where(lost[:, k], 0.0, costs[:, k]).sum(axis=1)
+            best = min(range(len(plans)), key=lambda i: (missed[i], cost[i]))
+            chosen.append((speed, plans[best]))
+        return tuple(chosen)
 
     def recovers(self, loop: ClosedLoop, error: FloatArray, span: float, plan: Plan) -> bool:
         """Whether a plan may be in use as far as every plausible plant is concerned.

@@ -22,7 +22,7 @@ class CascadeState:
     ``disturbance`` how large a matched disturbance is, in the inputs' units, (m,), where it is
     estimated; ``ahead`` what will be best for the estimate at the decision after the first, a plan
     from then on, which that begins with; ``after_jump`` what takes over when the velocities jump,
-    see :meth:`.Cascade.prepared`.
+    by the speeds up to which it does, see :meth:`.Cascade.prepared`.
     """
 
     plan: Plan
@@ -35,7 +35,7 @@ class CascadeState:
     target: ReferenceMotion | None = None
     disturbance: tuple[float, ...] = ()
     ahead: Plan | None = None
-    after_jump: Plan | None = None
+    after_jump: tuple[tuple[float, Plan], ...] = ()
 
     @property
     def surface(self) -> Surface:

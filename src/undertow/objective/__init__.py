@@ -16,8 +16,8 @@ from undertow.objective.objective import (
 )
 
 __all__ = [
-    "TRAVEL",
     "ERROR_PRICE",
+    "TRAVEL",
     "USUAL",
     "Constraint",
     "Goal",

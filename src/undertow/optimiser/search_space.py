@@ -22,7 +22,6 @@ from undertow.law import LawLayout, Plan, ReachingLaw, Surface, rising_from_zero
 from undertow.models import FloatArray, Mechanism, ModelError
 from undertow.symbolic import compiled
 
-
 #: Slowest rate η/ε at which a surface is reached, 1/s, where the rate alone is free; and how many
 #: times as fast as what leaves the target by itself it is at least: a slower law bears little that
 #: the model does not know.

@@ -276,7 +276,7 @@ class Controller:
         if asked is not None:
             self._close(asked.sequence)
         number, use = self._sequence + 1, t + self.period
-        plan = self.cascade.after_jump(self.memory)
+        plan = self.cascade.after_jump(self.memory, self.wrapped)
         before, why = self.memory, "a plan in reserve: the velocities have jumped"
         memory = replace(before, plan=plan, since=use, sequence=number, x=())
         proposal = Proposal(plan, "budget spent", math.inf, math.inf, (), 0, 0.0, number, use)

@@ -259,10 +259,13 @@ def memory_from(value: Mapping[str, Any], reference: ReferenceMotion | None = No
     if q is not None and q != MOVING:
         target = ReferenceMotion.at_rest(np.array(q, dtype=float))
     learnt = value.get("estimate")
-    plans = {name: value.get(name) for name in ("ahead", "after_jump")}
+    ahead, jumps = value.get("ahead"), value.get("after_jump") or ()
+    if isinstance(jumps, dict):  # logs before this one have one plan for all speeds
+        jumps = ((math.inf, jumps),)
     changed = {
         "plan": _plan_from(value["plan"]),
-        **{name: None if plan is None else _plan_from(plan) for name, plan in plans.items()},
+        "ahead": None if ahead is None else _plan_from(ahead),
+        "after_jump": tuple((speed, _plan_from(plan)) for speed, plan in jumps),
         "x": x,
         "target": target,
         "estimate": None if learnt is None else _estimate_from(learnt),

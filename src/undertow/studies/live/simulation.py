@@ -529,7 +529,7 @@ class Simulation:
         if self.memory is None or self.mode != RUNNING:
             return
         cascade, error = self._cascade(self._task), self._error(self.rig.truth)
-        plan = cascade.after_jump(self.memory)
+        plan = cascade.after_jump(self.memory, error)
         before, lane = self.law.reaching, self.law.lane
         surface, reaching = plan.at(0.0)
         self.law.use(surface, reaching or cascade.reaching)

@@ -111,7 +111,7 @@ class CascadeSteering:
 
     def _take_reserve(self, t: float, x: FloatArray) -> None:
         """Go on with the plan in reserve, where its law exists."""
-        plan = self.cascade.after_jump(self.memory)
+        plan = self.cascade.after_jump(self.memory, self.memory.error(t, x))
         self.law.follow(plan, 0.0, self.cascade.reaching)
         self.law(x)
         if self.law.margin[0] > Settings().min_margin:
