@@ -157,7 +157,7 @@ def sticking_distance(
     taken off for it before adds to it: until k_u q_u is more than both the joint stands, and the
     free ones fall.  ‖q_u‖ = 2 |d_i| / ‖k_u,i‖ for the input i, rad or m; of several inputs the
     largest.  A soft law sways so far from side to side for ever, however well it does without
-    friction.  0 where the free joints do not fall while the driven ones stand, as a load that hangs.
+    friction.  0 where the free joints do not fall while the driven ones stand, as one that hangs.
 
     Parameters
     ----------

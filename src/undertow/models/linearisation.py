@@ -63,6 +63,11 @@ class Linearisation:
         return float(np.abs(np.linalg.eigvals(self.A)).max())
 
     @property
+    def growth(self) -> float:
+        """Rate at which what leaves the target by itself grows, the largest Re λ or 0, 1/s."""
+        return max(0.0, float(np.linalg.eigvals(self.A).real.max()))
+
+    @property
     def input(self) -> FloatArray:
         """Input matrix of ẋ = A x + B u, (2n, m)."""
         n, m = len(self.M), len(self.B)
@@ -169,6 +174,14 @@ def linear_numbers(
         else found[1]
     )
     return mass.reshape(count, n, n), slopes, _gain(mechanism, values)
+
+
+def growth_rate(mechanism: Mechanism) -> float:
+    """Return how fast what leaves the target by itself grows, 1/s; 0 without a linear model."""
+    try:
+        return linearise(mechanism).growth
+    except ModelError:
+        return 0.0
 
 
 def fastest_rate(mechanism: Mechanism) -> float:

@@ -19,7 +19,7 @@ from undertow.base import InvalidInputError, check_fields, positive, require
 from undertow.closed_loop import ClosedLoop, RolloutBuffers
 from undertow.closed_loop.trajectory import Batch
 from undertow.law import LawLayout, Plan, ReachingLaw, Surface, rising_from_zero
-from undertow.models import FloatArray, Mechanism, ModelError
+from undertow.models import FloatArray, growth_rate
 from undertow.symbolic import compiled
 
 #: Slowest rate η/ε at which a surface is reached, 1/s, where the rate alone is free; and how many
@@ -42,8 +42,8 @@ class DecisionVariables:
         Also the off-diagonal entries of α_a (m > 1); its diagonal stays −1.
     rate
         Of the reaching law the rates η_i/ε_i alone, at most those of the given law, whose gains η_i
-        stay: near the target it may be gentler then, and far from it is as strong as ever.  ``None``:
-        where :func:`undertow.runtime.for_rig` finds that it pays.
+        stay: near the target it may be gentler then, and far from it is as strong as ever.
+        ``None``: where :func:`undertow.runtime.for_rig` finds that it pays.
     schedule
         Surfaces one after another, with their reaching laws.  For least time each for so long, s,
         and as many as the motion needs; for another cost five, the first for so long or longer,
@@ -95,18 +95,6 @@ class DecisionVariables:
         return replace(self, alpha_a=False) if self.alpha_a else None
 
 
-def slowest_rate(mechanism: Mechanism) -> float:
-    """The slowest rate η/ε at which a surface of a mechanism may be reached, 1/s.
-
-    ``FASTER`` times that of the fastest motion that leaves the target by itself.
-    """
-    try:
-        growth = np.linalg.eigvals(mechanism.linearise().A).real.max()
-    except ModelError:  # without a linear model nothing is known of it
-        growth = 0.0
-    return max(SLOWEST, FASTER * float(growth))
-
-
 class SearchSpace:
     """Search coordinates z for plans of one closed loop.
 
@@ -130,7 +118,7 @@ class SearchSpace:
         self._fastest = 0.8 / (loop.step * max(1, loop.zoh_steps))
         eta, layer = loop.reaching.per_surface(m)
         self._eta, self._highest = eta, eta / layer
-        self._lowest = np.minimum(slowest_rate(loop.mechanism), self._highest)
+        self._lowest = np.minimum(max(SLOWEST, FASTER * growth_rate(loop.mechanism)), self._highest)
 
     def at(self, times: tuple[float, ...]) -> SearchSpace:
         """Return the coordinates of the same kind for surfaces that take over at these times, s."""
