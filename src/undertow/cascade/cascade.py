@@ -313,7 +313,7 @@ class Cascade:
 
         Candidates are the plan in use, then the first optimum from x, (2n,), and those of
         :attr:`reserve`, both reached ever more strongly.  Who steers a plant that may be pushed
-        asks for it once, before the run.
+        asks for it after each first plan: before the run, and for every other target.
         """
         error = state.error(state.since, self.mechanism.check_state(x))
         known = state.estimate
