@@ -159,7 +159,8 @@ def _write_mcap(writer: Any, recording: Recording) -> None:
          [(name, place[name]) for name in names])
         for topic, names in groups.items()
     ]  # fmt: skip
-    answers = channel("/answers", _numbers({"k": "", **dict.fromkeys(_ANSWER, ""), **_OF_ANSWERS}, loose=True))
+    of_answers = {"k": "", **dict.fromkeys(_ANSWER, ""), **_OF_ANSWERS}
+    answers = channel("/answers", _numbers(of_answers, loose=True))
     events = channel("/events", _LINE)
     lines = sorted(_lines(recording, answers, events), key=lambda line: line[0])
     ahead = 0
