@@ -826,6 +826,30 @@ def test_progress_says_how_much_time_is_left(
     assert capsys.readouterr().err.splitlines() == ["… a", "… b, 30 s left", "… c"]
 
 
+def test_what_comes_before_any_of_it_is_done_is_no_pace(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A first search of a minute made ten seconds of motion look like ten minutes."""
+    clock = iter((100.0, 160.0, 170.0))
+    monkeypatch.setattr("undertow.cli.terminal.time.monotonic", lambda: next(clock))
+    with progress_bar() as tell:
+        for what, part in (("search", 0.0), ("b", 0.0), ("c", 0.5)):
+            tell(what, part)
+    assert capsys.readouterr().err.splitlines() == ["… search", "… b", "… c, 10 s left"]
+
+
+def test_a_cascade_says_that_it_searches_before_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It said nothing until the first plan was there, which takes half a minute of compiling."""
+
+    def searching(*_: object, progress: Callable[[float, float], None], **_more: object) -> None:
+        progress(0.0, 1.0)
+        raise InvalidInputError("end of the test")
+
+    monkeypatch.setattr("undertow.cli.control.Cascade.simulate", searching)
+    _, _, err = run("simulate", RIG)
+    assert err.splitlines()[:2] == ["… searching for the first plan", "… cascade"]
+
+
 def test_what_little_is_done_does_not_say_how_much_time_is_left(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

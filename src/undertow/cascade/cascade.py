@@ -642,7 +642,8 @@ class Cascade:
             :mod:`undertow.cascade.holding`; without one until the last set-point, or the end of a
             horizon.  See :mod:`undertow.cascade.simulation`.
         progress
-            Called with (time, duration) each time that it decides or learns.
+            Called with (time, duration) when the first plan is there, and then each time that it
+            decides or learns.
 
         Raises
         ------
@@ -687,6 +688,8 @@ class Cascade:
                 plan, predicted = memory.plan, memory.predicted
                 updates.append(Update(t, x, proposal, admission, plan, predicted, spent, task))
                 spent, planned_with = 0.0, memory.estimate
+            if progress is not None and not pieces:
+                progress(0.0, legs[-1].end)
             pieces.append(simulate_piece(self, truth, memory, x, t, span, leg.stays))
             motion = pieces[-1]
             memory = self.learn(memory, motion.t, motion.x, motion.u)

@@ -159,6 +159,7 @@ def certify(
         if task is not None:
             _, begin, goal = task
             cascade = Cascade(mechanism, goal, gate=certified_gate(), seed=seed, belief="exact")
+            progress("searching for the first plan", 0.0)
             motion = cascade.simulate(begin, progress=lambda t, end: progress("cascade", t / end))
             for one in certification.certify_run(
                 mechanism, motion, reaching_law=cascade.reaching, kept=keep, progress=progress

@@ -134,6 +134,7 @@ def simulate(
             cold=cold,
         )  # fmt: skip
         with progress_bar() as progress:
+            progress("searching for the first plan", 0.0)
             run = cascade.simulate(
                 x0,
                 plant=truth,

@@ -262,7 +262,8 @@ def progress_bar() -> Iterator[Progress]:
     def told(what: str, part: float) -> str:
         """Add how long the rest takes, once enough is done to tell."""
         now = time.monotonic()
-        begun[:] = begun or [(part, now)]
+        if not begun or part <= begun[0][0]:  # what takes long before any of it is done counts not
+            begun[:] = [(part, now)]
         done = part - begun[0][0]
         if done < ENOUGH or part >= 1:
             return what
