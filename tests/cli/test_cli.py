@@ -983,3 +983,19 @@ def test_a_unit_that_is_typed_is_not_said_to_be_wanted_in_si() -> None:
     with pytest.raises(InvalidInputError, match="unit that the mechanism gives") as refused:
         parse_values(["drive=5kN"], "limit of input")
     assert "SI" not in str(refused.value)
+
+
+def test_a_quick_trial_does_what_is_asked_for_beside_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``--seeds 7 --quick`` made three, and ``--limits --quick`` none."""
+    from undertow.studies.trials import experiments
+
+    asked: list[dict[str, object]] = []
+
+    def balance(seeds: int = 20, angle: float = 0.6, limits: bool = True) -> None:
+        asked.append({"seeds": seeds, "limits": limits})
+
+    monkeypatch.setitem(experiments.EXPERIMENTS, "balance", balance)
+    monkeypatch.setattr("undertow.cli.trials.carry_out", lambda *_: None)
+    run("trials", "balance", "--quick")
+    run("trials", "balance", "--quick", "--seeds", "7", "--limits")
+    assert asked == [{"seeds": 3, "limits": False}, {"seeds": 7, "limits": True}]
