@@ -843,6 +843,7 @@ def test_a_cascade_says_that_it_searches_before_it_does(monkeypatch: pytest.Monk
 
     def searching(*_: object, progress: Callable[[float, float], None], **_more: object) -> None:
         progress(0.0, 1.0)
+        progress(0.02, 1.0)
         raise InvalidInputError("end of the test")
 
     monkeypatch.setattr("undertow.cli.control.Cascade.simulate", searching)

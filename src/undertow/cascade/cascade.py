@@ -642,8 +642,8 @@ class Cascade:
             :mod:`undertow.cascade.holding`; without one until the last set-point, or the end of a
             horizon.  See :mod:`undertow.cascade.simulation`.
         progress
-            Called with (time, duration) when the first plan is there, and then each time that it
-            decides or learns.
+            Called with (time, duration) before the first search and after it, at the time 0, and
+            then each time that it decides or learns.
 
         Raises
         ------
@@ -668,6 +668,8 @@ class Cascade:
             home = memory is not None and holding.at_home(memory, memory.error(t, x), t)
             if t == leg.begin or home or arrived:  # to leave what was reached begins another task
                 since = t
+            if progress is not None and memory is None:
+                progress(0.0, legs[-1].end)
             if memory is None or t == leg.begin:
                 memory, proposal = self._planning.first(x, leg.target, t, memory, leg.longest)
                 admission = self.first_admission(memory, x, leg.longest)

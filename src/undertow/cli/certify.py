@@ -13,6 +13,7 @@ from rich.console import RenderableType
 from undertow.base import Progress, one_of, require
 from undertow.cascade import Cascade
 from undertow.cli import options
+from undertow.cli.control import FIRST_PLAN
 from undertow.cli.parsing import (
     mechanism_named,
     parse_start,
@@ -159,8 +160,10 @@ def certify(
         if task is not None:
             _, begin, goal = task
             cascade = Cascade(mechanism, goal, gate=certified_gate(), seed=seed, belief="exact")
-            progress("searching for the first plan", 0.0)
-            motion = cascade.simulate(begin, progress=lambda t, end: progress("cascade", t / end))
+            motion = cascade.simulate(
+                begin,
+                progress=lambda t, end: progress("cascade" if t else FIRST_PLAN, t / end),
+            )
             for one in certification.certify_run(
                 mechanism, motion, reaching_law=cascade.reaching, kept=keep, progress=progress
             ):

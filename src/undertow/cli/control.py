@@ -27,6 +27,9 @@ from undertow.objective import USUAL
 from undertow.optimiser import Budget, DecisionVariables, Optimiser
 from undertow.runtime import default_gate
 
+#: What a cascade does before anything moves, in words.
+FIRST_PLAN = "searching for the first plan"
+
 
 @command(
     "undertow simulate rotary_pendulum --start phi=35deg",
@@ -134,12 +137,11 @@ def simulate(
             cold=cold,
         )  # fmt: skip
         with progress_bar() as progress:
-            progress("searching for the first plan", 0.0)
             run = cascade.simulate(
                 x0,
                 plant=truth,
                 target=goes_to,
-                progress=lambda t, end: progress("cascade", t / end),
+                progress=lambda t, end: progress("cascade" if t else FIRST_PLAN, t / end),
             )
         motion, surfaces = run.trajectory, run.surfaces
     else:
