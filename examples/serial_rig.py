@@ -27,7 +27,10 @@ import undertow as ut
 from undertow.estimators import KalmanFilter, run_recorded
 from undertow.law import InnerLoop
 from undertow.models import FloatArray
-from undertow.plants import Measurement, RealisticRig, srv02_rig
+from undertow.plants import Measurement, OutputOnError, RealisticRig, srv02_rig
+
+#: How long an answer is waited for where no clock drives the loop, and in the end, s.
+PATIENCE = 0.004
 
 
 class SerialRig:
@@ -71,20 +74,24 @@ class SerialRig:
         os.write(self.line, command(self.number, u[0]))
 
     def close(self) -> None:
-        """Leave the motor without voltage: ask for zero until the device answers, five times."""
-        with contextlib.suppress(OSError):  # the device may be gone
+        """Leave the motor without voltage: ask for zero until the device answers, five times.
+
+        Raises OutputOnError where it does not: nobody knows then what the motor does.
+        """
+        self.timeout, why = max(self.timeout, PATIENCE), "five commands of 0 V were not answered"
+        try:
             for _ in range(5):
                 self.write([0.0])
                 self.read()
                 if self.answered == self.number:
-                    break
-        with contextlib.suppress(OSError):
-            fcntl.ioctl(self.line, termios.TIOCNXCL)
-        os.close(self.line)
-
-
-#: How long an answer is waited for where no clock drives the loop, s.
-PATIENCE = 0.004
+                    return
+        except OSError as error:  # the device may be gone
+            why = str(error)
+        finally:
+            with contextlib.suppress(OSError):
+                fcntl.ioctl(self.line, termios.TIOCNXCL)
+            os.close(self.line)
+        raise OutputOnError(f"the device may still drive the motor: {why}")
 
 
 def emulate(rig: RealisticRig) -> str:

@@ -24,7 +24,10 @@ import undertow as ut
 from undertow.estimators import KalmanFilter, run_recorded
 from undertow.law import InnerLoop
 from undertow.models import FloatArray
-from undertow.plants import Measurement, RealisticRig, srv02_rig
+from undertow.plants import Measurement, OutputOnError, RealisticRig, srv02_rig
+
+#: How long an answer is waited for where no clock drives the loop, and in the end, s.
+PATIENCE = 0.004
 
 
 class UdpRig:
@@ -61,18 +64,23 @@ class UdpRig:
         self.socket.send(command(self.number, u[0]))
 
     def close(self) -> None:
-        """Leave the motor without voltage: ask for zero until the device answers, five times."""
-        with contextlib.suppress(OSError):  # the device may be gone
+        """Leave the motor without voltage: ask for zero until the device answers, five times.
+
+        Raises OutputOnError where it does not: nobody knows then what the motor does.
+        """
+        self.timeout, why = max(self.timeout, PATIENCE), "five commands of 0 V were not answered"
+        try:
             for _ in range(5):
                 self.write([0.0])
                 self.read()
                 if self.answered == self.number:
-                    break
-        self.socket.close()
+                    return
+        except OSError as error:  # the device may be gone
+            why = str(error)
+        finally:
+            self.socket.close()
+        raise OutputOnError(f"the device may still drive the motor: {why}")
 
-
-#: How long an answer is waited for where no clock drives the loop, s.
-PATIENCE = 0.004
 
 #: A device takes orders from another sender once the first has been silent for so long, s.
 SILENCE = 1.0

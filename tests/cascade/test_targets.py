@@ -16,6 +16,7 @@ from undertow.cascade.simulation import legs_to, moments
 from undertow.closed_loop.along_reference import simulate_along
 from undertow.law import ReferenceMotion
 from undertow.models import FloatArray
+from undertow.runtime import Request, respond
 
 CRANE = ut.mechanisms.overhead_crane()
 #: Without its travel: about a target it has the formulas that it has about zero.
@@ -161,6 +162,20 @@ def test_what_takes_over_after_a_jump_is_chosen_by_its_size() -> None:
     loop = cascade.loop_at(state)
     small = loop.batch(speeds[0] * knock, list(plans)).score(loop.objective.horizon)
     assert small[0] == small.min() < 0.9 * small[-1]
+
+
+def test_what_takes_over_after_a_jump_is_chosen_anew_for_another_target(
+    cascade: ut.Cascade,
+) -> None:
+    """It stayed what had been chosen on the way to the first target."""
+    stale, x = ut.Plan.of(cascade.optimiser.anchor), CRANE.state(theta=0.05)
+    memory = replace(CascadeState(stale), after_jump=stale)
+    there = ReferenceMotion.at_rest(np.array([0.5, 0.0]))
+    answer = respond(cascade, Request(0.0, x, 0.0, memory, target=there))
+    assert answer.jump
+    assert answer.memory.after_jump is not stale
+    afresh = replace(answer.memory, after_jump=None)
+    assert answer.memory.after_jump == cascade.prepared(afresh, x).after_jump
 
 
 def test_the_pieces_of_a_run_leave_no_gap() -> None:

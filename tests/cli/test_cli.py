@@ -181,6 +181,28 @@ def test_version_and_bare_call() -> None:
         (("optimise", RIG, "--evaluations", "0"), "0 evaluations", "at least 1"),
         (("simulate", RIG, "--evaluations", "0"), "0 evaluations", "at least 1"),
         (("simulate", RIG, "--control", "designed", "--evaluations", "9"), "9", "a cascade"),
+        # What is typed out is refused where nothing uses it, its default, too.
+        (("simulate", RIG, "--surface", SURFACE, "--period", ".1"), "0.1, with one", "the cascade"),
+        (("simulate", RIG, "--control", "designed", "--schedule", "0"), "0, with one", "cascade"),
+        (("simulate", RIG, "--control", "designed", "--seed", "0"), "0, without a s", "--control"),
+        (("certify", RIG, "--objective", "energy"), "energy, without --run", "with --run"),
+        (("certify", RIG, "--horizon", "60"), "60, without --run", "with --run"),
+        (("certify", RIG, "--seed", "2"), "2, without --run", "with --run"),
+        (("certify", RIG, "--hold", "0"), "0, without --loop", "loop's proof"),
+        (("verify", "none.json", "--seconds", "600"), "600, without --both", "second checker"),
+        (("show", "run.db", "--objective", "effort"), "effort, with a log", "for a mechanism"),
+        (("show", "run.db", "--seed", "0"), "0, with a log", "for a mechanism"),
+        (("show", RIG, "--save", "page.html", "--port", "0"), "0, with --save", "is served"),
+        (("show", RIG, "--save", "page.html", "--no-browser"), "with --save", "is served"),
+        (("run", RIG, "--simulated", "--worker", "thread"), "thread, with --sim", "the clock"),
+        (("run", RIG, "--simulated", "--no-lockstep"), "with --simulated", "the clock"),
+        (("bench", RIG, "--rig", "ideal", "--seed", "0"), "0, with --rig ideal", "realistic rig"),
+        (("export", "c", RIG, "--check", "--objective", "energy"), "energy, without", "one-time"),
+        (("export", "c", RIG, "--check", "--seed", "0"), "0, without a search", "one-time"),
+        (("export", "c", RIG, "--check", "--states", "100000"), "100000, without", "--report"),
+        (("export", "c", RIG, "--out", "c", "--compiler", "gcc"), "gcc, where nothing", "--check"),
+        (("models", "robots", "--no-simulate", "--seed", "0"), "0, with --no-sim", "motions"),
+        (("drill", "--kills", "3", "--no-live"), "with another drill", "single faults"),
         (("simulate", RIG, "--start", "phi=1e300rad"), "1e+300 rad", "±4.5e+13 rad"),
         (("optimise", RIG, "--start", "theta_dot=1e14rad/s"), "1e+14 rad/s", "±4.5e+13 rad/s"),
         (("show", RIG, "--save", "page.html", "--start", "phi=1e300rad"), "1e+300", "±4.5e+13"),
@@ -200,23 +222,31 @@ def test_version_and_bare_call() -> None:
         (("run", CRANE, "--simulated", "--target", "x=2m"), "x = 2 m", "95 % of the travel"),
         (("simulate", RIG, "--control", "designed", "--accept", "local"), "local", "the cascade"),
         (("simulate", RIG, "--control", "one-time", "--belief", "usual"), "usual", "the cascade"),
-        (("simulate", RIG, "--control", "designed", "--schedule", ".1"), "0.1 s", "the cascade"),
-        (("simulate", RIG, "--surface", SURFACE, "--period", ".2"), "0.2 s", "the cascade"),
+        (
+            ("simulate", RIG, "--control", "designed", "--schedule", ".1"),
+            "0.1, with one surface",
+            "the cascade",
+        ),
+        (
+            ("simulate", RIG, "--surface", SURFACE, "--period", ".2"),
+            "0.2, with one surface",
+            "the cascade",
+        ),
         (("simulate", RIG, "--schedule", "99"), "99 s", "0 s to 60 s"),
         (("certify", RIG, "--objective", "time"), "time, without --run", "with --run"),
-        (("certify", RIG, "--horizon", "3"), "3 s, without --run", "with --run"),
+        (("certify", RIG, "--horizon", "3"), "3, without --run", "with --run"),
         (("certify", "--appendix", "--surface", SURFACE), "lambda_a", "left out"),
         (("certify", "--appendix", "--start", "phi=5deg"), "phi=5deg", "left out"),
-        (("certify", "--appendix", "--run"), "--run with --appendix", "left out"),
-        (("verify", "none.json", "--seconds", "9"), "9 s, without --both", "second checker"),
-        (("drill", "--systematic", "--kills", "3"), "3 kills, --systematic", "one of them"),
+        (("certify", "--appendix", "--run"), "with --appendix", "left out"),
+        (("verify", "none.json", "--seconds", "9"), "9, without --both", "second checker"),
+        (("drill", "--systematic", "--kills", "3"), "3, with --systematic", "one of them"),
         (("show", "run.db", "--objective", "time"), "time", "for a mechanism"),
-        (("show", "run.db", "--period", "0.2"), "0.2 s", "for a mechanism"),
+        (("show", "run.db", "--period", "0.2"), "0.2, with a log", "for a mechanism"),
         (("show", "run.db", "--seed", "1"), "1", "for a mechanism"),
         (("animate", RIG, "--speed", "0"), "0.0", "> 0"),
         (("animate", RIG, "--longest", "-1"), "-1.0", "> 0"),
         (("derive", "robot.sdf"), "'.sdf'", ".urdf, .xml, .mjcf"),
-        (("bench", RIG, "--quick", "--delay", "0.002"), "0.002 s", "one of them"),
+        (("bench", RIG, "--quick", "--delay", "0.002"), "0.002, with --quick", "left out"),
         (("bench", RIG, "--delay", "-1"), "-1", "≥ 0"),
         (("export", "c", RIG, "--check", "--objective", "speed"), "'speed'", "bench-time"),
         (("export", "c", RIG, "--check", "--objective", "time"), "time", "--control one-time"),
@@ -232,8 +262,13 @@ def test_version_and_bare_call() -> None:
         (("export", "c", RIG, "--check", "--period", "0"), "0.0", "> 0, < 1 s"),
         (
             ("campaign", "none.toml", "--out", "s.zarr", "--proof", "p.json"),
-            "no --picture",
+            "p.json, without --picture",
             "shows",
+        ),
+        (
+            ("campaign", "none.toml", "--out", "s.zarr", "--status", "--threads", "2"),
+            "2, with --status",
+            "for a run",
         ),
     ],
 )
@@ -791,6 +826,31 @@ def test_progress_says_how_much_time_is_left(
     assert capsys.readouterr().err.splitlines() == ["… a", "… b, 30 s left", "… c"]
 
 
+def test_what_comes_before_any_of_it_is_done_is_no_pace(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A first search of a minute made ten seconds of motion look like ten minutes."""
+    clock = iter((100.0, 160.0, 170.0))
+    monkeypatch.setattr("undertow.cli.terminal.time.monotonic", lambda: next(clock))
+    with progress_bar() as tell:
+        for what, part in (("search", 0.0), ("b", 0.0), ("c", 0.5)):
+            tell(what, part)
+    assert capsys.readouterr().err.splitlines() == ["… search", "… b", "… c, 10 s left"]
+
+
+def test_a_cascade_says_that_it_searches_before_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It said nothing until the first plan was there, which takes half a minute of compiling."""
+
+    def searching(*_: object, progress: Callable[[float, float], None], **_more: object) -> None:
+        progress(0.0, 1.0)
+        progress(0.02, 1.0)
+        raise InvalidInputError("end of the test")
+
+    monkeypatch.setattr("undertow.cli.control.Cascade.simulate", searching)
+    _, _, err = run("simulate", RIG)
+    assert err.splitlines()[:2] == ["… searching for the first plan", "… cascade"]
+
+
 def test_what_little_is_done_does_not_say_how_much_time_is_left(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -924,3 +984,19 @@ def test_a_unit_that_is_typed_is_not_said_to_be_wanted_in_si() -> None:
     with pytest.raises(InvalidInputError, match="unit that the mechanism gives") as refused:
         parse_values(["drive=5kN"], "limit of input")
     assert "SI" not in str(refused.value)
+
+
+def test_a_quick_trial_does_what_is_asked_for_beside_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``--seeds 7 --quick`` made three, and ``--limits --quick`` none."""
+    from undertow.studies.trials import experiments
+
+    asked: list[dict[str, object]] = []
+
+    def balance(seeds: int = 20, angle: float = 0.6, limits: bool = True) -> None:
+        asked.append({"seeds": seeds, "limits": limits})
+
+    monkeypatch.setitem(experiments.EXPERIMENTS, "balance", balance)
+    monkeypatch.setattr("undertow.cli.trials.carry_out", lambda *_: None)
+    run("trials", "balance", "--quick")
+    run("trials", "balance", "--quick", "--seeds", "7", "--limits")
+    assert asked == [{"seeds": 3, "limits": False}, {"seeds": 7, "limits": True}]

@@ -12,8 +12,10 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
+import undertow as ut
 from support import rest_slow
 from undertow.cli import app
+from undertow.runtime import read_log
 
 runner = CliRunner()
 
@@ -103,7 +105,24 @@ def test_a_run_ends_with_a_verdict_and_its_exit_code(tmp_path: Path) -> None:
 def test_a_supervisor_is_refused_in_simulated_time() -> None:
     code, _, err = run("run", "rotary_pendulum", "--simulated", "--supervisor")
     assert code == 2
-    assert "--supervisor with --simulated" in err
+    assert "--supervisor: got with --simulated" in err
+
+
+@pytest.mark.slow
+def test_a_run_in_mujoco_has_one_estimator_in_python_and_on_the_command_line(
+    tmp_path: Path,
+) -> None:
+    """That of a usual bench: the command line had the one for exact states."""
+    pytest.importorskip("mujoco")
+    from undertow.plants import MuJoCoRig
+
+    typed, called = tmp_path / "typed.db", tmp_path / "called.db"
+    words = ("--rig", "mujoco", "--simulated", "--seconds", "0.05", "--delay", "0.002")
+    run("run", "rotary_pendulum", *words, "--log", str(typed))
+    rig = ut.mechanisms.rotary_pendulum()
+    ut.run(ut.Cascade(rig), MuJoCoRig(rig), seconds=0.05, simulated=True, log=called, delay=0.002)
+    kinds = [read_log(log).meta["recipe"]["rig"] for log in (typed, called)]
+    assert kinds == ["realistic", "realistic"]
 
 
 KEPT = """
@@ -182,11 +201,13 @@ def test_who_has_reversed_encoders_is_shown_the_way_to_the_bench(tmp_path: Path)
     """Lost at once, where the law is singular: the run knows the place, the bench the reason."""
     (tmp_path / "arm.py").write_text(REVERSED)
     place = f"{tmp_path / 'arm.py'}:Arm"
-    code, out, _ = run("run", "rotary_pendulum", "--rig", place, "--simulated", "--seconds", "2")
+    code, out, _ = run(
+        "run", "rotary_pendulum", "--rig", place, "--set", "m=0.13", "--simulated", "--seconds", "2"
+    )
     assert code == 4
     said = " ".join(out.split())
     assert re.search(r"thrown out: (the law is singular at phi = |phi is )-?\d", said)
-    assert f"undertow bench rotary_pendulum --rig {place} checks signs" in said
+    assert f"undertow bench rotary_pendulum --rig {place} --set m=0.13 checks signs" in said
 
 
 LEAVES = """

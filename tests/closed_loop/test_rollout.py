@@ -789,6 +789,16 @@ def test_a_step_may_be_as_long_as_the_layer_bears(rig: ut.Mechanism) -> None:
         ut.ClosedLoop(two, reaching=uneven, step=0.021)
 
 
+def test_the_laws_of_a_plan_are_held_to_the_sample_period(
+    rig: ut.Mechanism, quick: ut.Surface
+) -> None:
+    """They were simulated whatever they were: η/ε = 2000 1/s and an input once in 2 ms."""
+    loop = ut.ClosedLoop(rig, zoh_steps=1)
+    fast = ut.Plan((quick,), reaching=(ut.ReachingLaw(eta=200.0, layer=0.1),))
+    with pytest.raises(InvalidInputError, match=r"sample period.*0\.002 s.*2 ε/η = 0\.001 s"):
+        loop.simulate(rig.state(phi=0.3), fast)
+
+
 def test_the_usual_values_are_the_documented_ones(
     loop: ut.ClosedLoop, rig: ut.Mechanism, quick: ut.Surface
 ) -> None:

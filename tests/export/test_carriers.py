@@ -157,7 +157,7 @@ def test_the_ros2_controller_is_the_python_law(name: str, tmp_path: Path) -> Non
     node = build_ros2(controller, tmp_path)
     joints = [f"joint_{c.name}" for c in mechanism.coordinates]
     positions = run_positions(controller)
-    for rate in ("1000", "0"):
+    for rate in ("1000", "0:1050"):  # 0: that of the manager
         code, out, said = run(tmp_path, node, rate, "positions", *joints, text=lines(positions))
         assert code == 0, said
     commands, seen, *rows, last = out.splitlines()
@@ -184,6 +184,11 @@ def test_the_ros2_controller_is_the_python_law(name: str, tmp_path: Path) -> Non
         code, _, said = run(tmp_path, node, *words)
         assert code == 2
         assert match in said
+    # A manager at 500 Hz, whose rate the controller has: the C was stepped half as often.
+    code, out, said = run(tmp_path, node, "0:500", "positions", *joints, text=lines(positions))
+    assert code == 5
+    assert "period: got 0.002 s, the mean of 100, must be 0.001 s" in said
+    assert [float(v) for v in out.splitlines()[-1].split()] == [0.0] * mechanism.m
 
 
 def test_the_ros2_package_fits_together() -> None:

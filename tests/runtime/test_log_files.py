@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections import defaultdict
 from dataclasses import replace
@@ -29,6 +30,15 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     rig = IdealRig(RIG, RIG.state(phi=0.2), 0.001)
     ut.run(cascade, rig, seconds=0.3, log=log, simulated=True, phi=0.2)
     return read_log(log)
+
+
+def strictly(text: str | bytes) -> Any:
+    """Read JSON as other languages do, in which Infinity and NaN are no words."""
+
+    def refused(word: str) -> None:
+        raise AssertionError(word)
+
+    return json.loads(text, parse_constant=refused)
 
 
 def test_units_are_those_of_the_mechanism(recording: Recording) -> None:
@@ -81,7 +91,7 @@ def test_pandas_reads_the_parquet_file_to_the_last_bit(
     assert frame["mode"].dtype == np.int64
     schema = parquet.read_schema(path)
     assert {f.name: f.metadata[b"unit"].decode() for f in schema} == column_units(recording)
-    rest = json.loads(schema.metadata[b"undertow"])
+    rest = strictly(schema.metadata[b"undertow"])
     assert rest["meta"]["mechanism"] == "rotary_pendulum"
     assert [tuple(event) for event in rest["events"]] == list(recording.events)
     assert len(rest["answers"]) == len(recording.answers) > 0
@@ -105,7 +115,8 @@ def test_the_reference_reader_finds_every_step_in_the_mcap_file(
             times.append(message.log_time)
         (facts,) = found.iter_metadata()
     assert times == sorted(times)
-    assert json.loads(facts.metadata["mechanism"]) == "rotary_pendulum"
+    told = {name: strictly(said) for name, said in facts.metadata.items()}
+    assert told["mechanism"] == "rotary_pendulum"
     for topic, names in (("/state", RIG.state_names), ("/input", ["voltage"])):
         table = [[values[name] for name in names] for _, values in said[topic]]
         expected = np.stack([recording[name] for name in names], axis=1)
@@ -115,6 +126,19 @@ def test_the_reference_reader_finds_every_step_in_the_mcap_file(
     assert len(said["/answers"]) == len(recording.answers)
     assert len(said["/events"]) == len(recording.events)
     assert all(values["message"] for _, values in said["/events"])
+
+
+def test_what_is_infinite_is_null_in_either_file(recording: Recording, tmp_path: Path) -> None:
+    """As the usual ``Settings.output_limit`` is: 'Infinity' is a word of Python's JSON alone."""
+    parquet = pytest.importorskip("pyarrow.parquet")
+    reader = pytest.importorskip("mcap.reader")
+    endless = replace(recording, meta={"settings": {"output_limit": math.inf, "left": [math.nan]}})
+    schema = parquet.read_schema(to_parquet(endless, tmp_path / "run.parquet"))
+    nothing = {"output_limit": None, "left": [None]}
+    assert strictly(schema.metadata[b"undertow"])["meta"]["settings"] == nothing
+    with open(to_mcap(endless, tmp_path / "run.mcap"), "rb") as stream:
+        (facts,) = reader.make_reader(stream).iter_metadata()
+    assert strictly(facts.metadata["settings"]) == nothing
 
 
 def test_what_is_not_a_number_is_left_out(recording: Recording, tmp_path: Path) -> None:

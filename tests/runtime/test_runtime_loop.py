@@ -239,6 +239,28 @@ def test_a_limit_of_the_output_leaves_the_objective_as_it_is() -> None:
     assert again.cascade.objective == recipe.cascade.objective == cascade.objective
 
 
+@pytest.mark.parametrize("designed", [False, True])
+def test_plans_are_made_within_the_travel_that_the_settings_leave(designed: bool) -> None:
+    """They went up to the mechanism's own, past where the run is stopped; a log still has it."""
+    cart = ut.mechanisms.cart_pendulum()
+    cascade = ut.Cascade(cart, ut.objective_for(cart, constraints=ut.state_box(phi=0.5)))
+    recipe = Recipe(
+        cart, objective=cascade.objective, horizon=60.0, design=cascade if designed else None,
+        settings=Settings(max_travel=1.0),
+    )  # fmt: skip
+    words = [c.words for c in recipe.cascade.loop.objective.constraints]
+    rail = "-0.95 ≤ x ≤ 0.95" if "-0.95 ≤ x ≤ 0.95" in str(words) else "|x| ≤ 0.95"
+    assert f"{rail}: 95 % of Settings(max_travel=1)" in words
+    assert "|phi| ≤ 0.5" in words
+    assert not any("1.425" in word for word in words)
+    wide = replace(recipe, settings=Settings(max_travel=30.0))
+    assert wide.cascade.objective.range_of(cart)[1][0] == pytest.approx(1.425)
+    named = replace(recipe, objective=ut.objective_for(cart, horizon=60.0), design=None)
+    written = named.in_names()
+    assert written is not None
+    assert Recipe.from_dict(written.as_dict()).cascade.objective == named.cascade.objective
+
+
 @pytest.mark.parametrize("period", [0.0, 0.15, float("nan")])
 def test_a_period_that_is_itself_a_stall_is_refused(period: float) -> None:
     with pytest.raises(InvalidInputError, match="period of a run"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import signal
 import threading
 import time
@@ -519,6 +520,16 @@ def test_a_clock_that_makes_no_sense_is_named(
     why = driven(controller, Device(read=read)).report.stopped_by
     assert "the rig's clock made no sense for 2" in why
     assert "later than the last one's, by 0.1 s at most" in why
+
+
+def test_a_device_that_falls_silent_is_not_taken_for_a_wrong_clock(controller: Controller) -> None:
+    """Lost readings of the example drivers have no time either."""
+
+    def read(k: int, m: Measurement) -> Measurement:
+        return Measurement(math.nan, np.full_like(m.q, math.nan)) if k > 50 else m
+
+    why = driven(controller, Device(read=read)).report.stopped_by
+    assert re.search(r"no sensor gave anything for 2\d ms, last at 0\.0", why)
 
 
 # -- how it ended ----------------------------------------------------------------------------------

@@ -315,7 +315,7 @@ class Cascade:
 
         Candidates are the plan in use, then the first optimum from x, (2n,), and those of
         :attr:`reserve`, both reached ever more strongly.  Who steers a plant that may be pushed
-        asks for it once, before the run.
+        asks for it after each first plan: before the run, and for every other target.
         """
         error = state.error(state.since, self.mechanism.check_state(x))
         known = state.estimate
@@ -651,7 +651,8 @@ class Cascade:
             :mod:`undertow.cascade.holding`; without one until the last set-point, or the end of a
             horizon.  See :mod:`undertow.cascade.simulation`.
         progress
-            Called with (time, duration) each time that it decides or learns.
+            Called with (time, duration) before the first search and after it, at the time 0, and
+            then each time that it decides or learns.
 
         Raises
         ------
@@ -676,6 +677,8 @@ class Cascade:
             home = memory is not None and holding.at_home(memory, memory.error(t, x), t)
             if t == leg.begin or home or arrived:  # to leave what was reached begins another task
                 since = t
+            if progress is not None and memory is None:
+                progress(0.0, legs[-1].end)
             if memory is None or t == leg.begin:
                 memory, proposal = self._planning.first(x, leg.target, t, memory, leg.longest)
                 admission = self.first_admission(memory, x, leg.longest)
@@ -696,6 +699,8 @@ class Cascade:
                 plan, predicted = memory.plan, memory.predicted
                 updates.append(Update(t, x, proposal, admission, plan, predicted, spent, task))
                 spent, planned_with = 0.0, memory.estimate
+            if progress is not None and not pieces:
+                progress(0.0, legs[-1].end)
             pieces.append(simulate_piece(self, truth, memory, x, t, span, leg.stays))
             motion = pieces[-1]
             memory = self.learn(memory, motion.t, motion.x, motion.u)

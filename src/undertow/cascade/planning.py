@@ -159,10 +159,7 @@ class Planning:
             costs = costs_along(whole, x, plans, target, t, horizon)
             k = int(np.argmin(costs))
             plan, cost = plans[k], costs[k]
-        kept = () if before is None else before.after_jump
-        begun = CascadeState(
-            plan, number, cost, cost, t, as_numbers(x), known, target, after_jump=kept
-        )
+        begun = CascadeState(plan, number, cost, cost, t, as_numbers(x), known, target)
         mends = planners.recourse and here.price_of_time > 0
         if mends and best.rank < 3 and not (target is not None and target.moves):
             begun = replace(begun, ahead=self._ahead(begun, x, horizon))

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 from rich.console import Group
 
-from undertow.base import InvalidInputError
 from undertow.cli import options
 from undertow.cli.parsing import mechanism_named, parse_values
 from undertow.cli.terminal import (
@@ -18,6 +17,7 @@ from undertow.cli.terminal import (
     command,
     enter_pressed,
     exit_unless,
+    needs,
     progress_bar,
     show,
     write,
@@ -75,13 +75,9 @@ def bench(
         summary,
     )
 
-    if quick and delay is not None:
-        raise InvalidInputError(
-            "--delay with --quick",
-            value=f"{delay:g} s",
-            limit="one of them: a quick check does not measure the delay",
-            remedy="Leave --quick out",
-        )
+    needs(not quick, "with --quick", "left out: a quick check does not measure it", "delay")
+    drawn = "for the realistic rig, whose friction and noise are drawn by it"
+    needs(rig == "realistic", f"with --rig {rig}", drawn, "seed")
     request = {"mechanism": name, "rig": rig, "fault": fault or [], "seed": seed}
     request |= {"setting": setting or [], "delay": delay, "quick": quick}
     belief = mechanism_named(name, setting)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from undertow.base import InvalidInputError, require, write_file
-from undertow.cli.terminal import command, completed, end_interrupted, exit_unless, show
+from undertow.cli.terminal import command, completed, end_interrupted, exit_unless, needs, show
 
 if TYPE_CHECKING:
     from undertow.studies.campaign import CampaignResult
@@ -99,11 +99,14 @@ def campaign(
     asked = [name for name, given in views.items() if given]
     both = " and ".join(asked)
     require(len(asked) < 2, "what is shown of the campaign", both, "one of them")
-    if proof is not None and picture is None:
-        raise InvalidInputError(
-            "--proof", value="no --picture", limit="a picture that shows it",
-            remedy="Add --picture map.png",
-        )  # fmt: skip
+    needs(
+        not asked, f"with {both}", "for a run: this looks at what the store has, or at one shard",
+        "threads", "workers", "scheduler", "limit", "resume",
+    )  # fmt: skip
+    needs(
+        picture is not None, "without --picture", "for a picture that shows it", "proof",
+        remedy="Add --picture map.png",
+    )  # fmt: skip
     task = Campaign(Definition.read(file, mechanism, entrant or ()), out)
     if picture is not None:
         from undertow.studies.campaign.figures import picture_file

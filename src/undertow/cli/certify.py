@@ -13,6 +13,7 @@ from rich.console import RenderableType
 from undertow.base import Progress, one_of, require
 from undertow.cascade import Cascade
 from undertow.cli import options
+from undertow.cli.control import FIRST_PLAN
 from undertow.cli.parsing import (
     mechanism_named,
     parse_start,
@@ -26,6 +27,7 @@ from undertow.cli.terminal import (
     completed,
     end_interrupted,
     exit_unless,
+    needs,
     progress_bar,
     show,
     write,
@@ -124,18 +126,15 @@ def certify(
     region = not run and (bool(seconds) if seconds is not None or appendix else True)
     require(appendix == (name is None), "undertow certify", given, "a mechanism, or --appendix")
     require(not (run and surface is not None), "--surface with --run", surface, alone)
-    for what, value in (("--run", run), ("--surface", surface), ("--start", start)):
-        words = "left out: the paper's cases have surfaces and starts of their own"
-        require(not (appendix and value), f"{what} with --appendix", value, words)
+    given = "left out: the paper's cases have surfaces and starts of their own"
+    needs(not appendix, "with --appendix", given, "run", "surface", "start")
     ways = "with --run, whose cascade it is for"
-    require(run or objective == "energy", "--objective", f"{objective}, without --run", ways)
-    require(run or horizon == 60.0, "--horizon", f"{horizon:g} s, without --run", ways)
+    needs(run, "without --run", ways, "objective", "horizon", "seed")
     require(timed, "--seconds", seconds, "in [0, 100000)")
     require(not (run and seconds), "--seconds", f"{seconds} s, with --run", brief)
     require(not (run and loop), "--loop", "with --run", brief)
     require(0 < effort < 1e5, "--loop-seconds", loop_seconds, "in (0, 100000)")
-    require(loop or loop_seconds is None, "--loop-seconds", "without --loop", own)
-    require(loop or not hold, "--hold", "without --loop", own)
+    needs(loop, "without --loop", own, "loop_seconds", "hold")
     bears = loop or region or not within
     require(bears, "--within", "without a region and --loop", "an option of their proofs")
     require(0 <= hold <= 100, "--hold", hold, whole)
@@ -161,7 +160,10 @@ def certify(
         if task is not None:
             _, begin, goal = task
             cascade = Cascade(mechanism, goal, gate=certified_gate(), seed=seed, belief="exact")
-            motion = cascade.simulate(begin, progress=lambda t, end: progress("cascade", t / end))
+            motion = cascade.simulate(
+                begin,
+                progress=lambda t, end: progress("cascade" if t else FIRST_PLAN, t / end),
+            )
             for one in certification.certify_run(
                 mechanism, motion, reaching_law=cascade.reaching, kept=keep, progress=progress
             ):
@@ -263,8 +265,7 @@ def verify(
     from undertow.studies import certification
     from undertow.studies.second_checker import agreement_table, decide_again
 
-    waits = both or seconds == 600.0
-    require(waits, "--seconds", f"{seconds:g} s, without --both", "with the second checker")
+    needs(both, "without --both", "with the second checker", "seconds")
     certificate = read_certificate(file)
     check_settings(certificate, parse_values(setting))
     known = mechanism is not None or certificate.name in LIBRARY

@@ -12,12 +12,23 @@ from undertow.base import InvalidInputError
 from undertow.cascade import Cascade, Gate
 from undertow.cli import options
 from undertow.cli.parsing import aimed, parse_surface, parse_target, parse_task, parse_values
-from undertow.cli.terminal import check_out, command, exit_unless, progress_bar, show, write
+from undertow.cli.terminal import (
+    check_out,
+    command,
+    exit_unless,
+    needs,
+    progress_bar,
+    show,
+    write,
+)
 from undertow.closed_loop import ClosedLoop
 from undertow.law import check_surface, first_surface, usual_reaching
 from undertow.objective import USUAL
 from undertow.optimiser import Budget, DecisionVariables, Optimiser
 from undertow.runtime import default_gate
+
+#: What a cascade does before anything moves, in words.
+FIRST_PLAN = "searching for the first plan"
 
 
 @command(
@@ -107,27 +118,15 @@ def simulate(
             limit="cascade, which follows targets",
             remedy="Leave one of them out",
         )
-    of_cascade = {
-        "--accept": ", ".join(accept or ()),
-        "--belief": known,
-        "--schedule": f"{schedule:g} s" if schedule else "",
-        "--period": f"{period:g} s" if period != 0.1 else "",
-    }
-    for what, value in of_cascade.items():
-        if value and steering != "cascade":
-            raise InvalidInputError(
-                what,
-                value=f"{value}, with one surface",
-                limit="the cascade, which decides by it",
-                remedy="Leave it out, or --control and --surface",
-            )
-    if evaluations is not None and steering not in ("cascade", "one-time"):
-        raise InvalidInputError(
-            "--evaluations",
-            value=f"{evaluations}, without a search",
-            limit="for a cascade, or --control one-time",
-            remedy="Leave it out",
-        )
+    needs(
+        steering == "cascade", "with one surface", "the cascade, which decides by it",
+        "accept", "known", "schedule", "period",
+        remedy="Leave it out, or --control and --surface",
+    )  # fmt: skip
+    needs(
+        steering in ("cascade", "one-time"), "without a search",
+        "for a cascade, or --control one-time", "evaluations", "seed",
+    )  # fmt: skip
     cold = None if evaluations is None else Budget(evaluations)
     if steering == "cascade":
         gate = default_gate() if accept is None else _evidence_gate(accept)
@@ -142,7 +141,7 @@ def simulate(
                 x0,
                 plant=truth,
                 target=goes_to,
-                progress=lambda t, end: progress("cascade", t / end),
+                progress=lambda t, end: progress("cascade" if t else FIRST_PLAN, t / end),
             )
         motion, surfaces = run.trajectory, run.surfaces
     else:

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, get_args
 import typer
 from rich.text import Text
 
-from undertow.base import InvalidInputError, one_of, require
+from undertow.base import InvalidInputError, one_of
 from undertow.cli import options
 from undertow.cli.options import option
 from undertow.cli.parsing import mechanism_named, objective_named, parse_start, parse_surface
@@ -21,6 +21,7 @@ from undertow.cli.terminal import (
     command,
     exit_unless,
     folded,
+    needs,
     progress_bar,
     show,
     write,
@@ -144,7 +145,7 @@ def export_c(
     prefix
         Prefix of every C name.
     compiler
-        C compiler for --check, --report, --for fmi.
+        C compiler for --check, --report, --rigs, --bit-flips, --for fmi.
     states
         Number of random states for --report.
     """
@@ -154,10 +155,12 @@ def export_c(
     wanted = check or report or bool(rigs) or bit_flips
     _check_request(name, out, every=every, wanted=wanted, carried=bool(platforms))
     one_of("objective", objective, get_args(Goal))
-    searched = objective == "energy" or control == "one-time"
     words = "with --control one-time, which looks for the best surface"
-    require(searched, "--objective", f"{objective}, without a search", words)
-    require(report or states == 100_000, "--states", f"{states}, without a report", "with --report")
+    needs(control == "one-time", "without a search", words, "objective", "seed")
+    needs(report, "without a report", "with --report", "states")
+    built = wanted or "fmi" in (platforms or ())
+    compiles = "with --check, --report, --rigs, --bit-flips or --for fmi"
+    needs(built, "where nothing is compiled", compiles, "compiler")
     check_out(out)
     given: dict[str, Any] = {k: v for k, v in (("eta", eta), ("layer", layer)) if v is not None}
     law = ReachingLaw(**given) if given else SUITED
@@ -188,9 +191,9 @@ def export_c(
     starts = (
         [parse_start(one.mechanism, start) for one in made] if start or rigs or bit_flips else []
     )
-    begun = control == "one-time" or rigs or bit_flips or platforms
+    begun = bool(control == "one-time" or rigs or bit_flips or platforms)
     words = "with --control one-time, --rigs, --bit-flips or --for fmi"
-    require(begun or not start, "--start", f"{', '.join(start or ())}, where nothing moves", words)
+    needs(begun, "where nothing moves", words, "start")
     written = {file: content for one in made for file, content in files(one).items()}
     for one in made if platforms else ():
         x0 = parse_start(one.mechanism, start) if start else None

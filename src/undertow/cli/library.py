@@ -9,7 +9,16 @@ import typer
 from undertow.cascade import problem_words
 from undertow.cli import options
 from undertow.cli.parsing import mechanism_named, parse_task
-from undertow.cli.terminal import carry_out, check_out, command, progress_bar, show, terminal, write
+from undertow.cli.terminal import (
+    carry_out,
+    check_out,
+    command,
+    needs,
+    progress_bar,
+    show,
+    terminal,
+    write,
+)
 from undertow.closed_loop import ClosedLoop
 from undertow.objective import USUAL
 from undertow.optimiser import Optimiser
@@ -119,6 +128,7 @@ def models(
     """
     from undertow.studies import model_files as study
 
+    needs(simulate, "with --no-simulate", "for the motions that it leaves out", "seed")
     work = study.model_files(folder_of_files, simulate=simulate, seed=seed)
     carry_out(work, out, seed=seed, least=100)
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 import typer
 from rich.console import RenderableType
 
-from undertow.base import InvalidInputError, printable, require
+from undertow.base import printable
 from undertow.cascade import problem_words
 from undertow.cli import options
 from undertow.cli.parsing import (
@@ -34,6 +34,7 @@ from undertow.cli.terminal import (
     command,
     enter_pressed,
     exit_unless,
+    needs,
     progress_bar,
     show,
     write,
@@ -99,7 +100,8 @@ def run(
     rig : RIG
         ideal: the model. realistic: a bench with friction, delay and encoders. mujoco: the physics
         engine, on the mechanism's own MJCF file if it has one. FILE.xml: your own MJCF.
-        FILE.py:NAME: your own driver, a class or a function that returns one.
+        FILE.py:NAME: your own driver, a class or a function that returns one. All but ideal get the
+        controller of a usual bench, which reckons with its encoders, delay and friction.
     swing_up
         Begin hanging at rest: swing up, catch, balance.
     known
@@ -108,8 +110,8 @@ def run(
     period
         Period of the fast loop, s.
     delay
-        From a write to its effect in a reading, s, as undertow bench measures it; of a realistic
-        rig and your own. Default: that of a usual bench, 1 ms; of the SRV02 1.5 ms.
+        From a write to its effect in a reading, s, as undertow bench measures it; of any rig but
+        ideal. Default: that of a usual bench, 1 ms; of the SRV02 1.5 ms.
     lead
         Shortest time from a request to the optimiser until its answer is applied, s; it is
         increased when answers arrive late. A short one keeps the optimiser busy.
@@ -146,7 +148,7 @@ def run(
         duration=max(1.0, seconds) if isinstance(goal, Reference) else 60.0,
         objective=cast(Goal, objective),  # the recipe refuses what is none
         learns=known == "usual",
-        rig="realistic" if rig == "realistic" or in_a_file(rig) else "ideal",
+        rig="ideal" if rig == "ideal" else "realistic",
         seed=seed,
         period=period,
         delay=delay,
@@ -155,20 +157,12 @@ def run(
     )
     if supervisor is None:
         supervisor = in_a_file(rig) and not simulated and hasattr(os, "fork")
-    if supervisor and simulated:
-        raise InvalidInputError(
-            "--supervisor with --simulated",
-            value="simulated time",
-            limit="the wall clock, by which a supervisor goes",
-            remedy="Leave one of them out",
-        )
-    if watch and simulated:
-        raise InvalidInputError(
-            "--show with --simulated",
-            value="simulated time",
-            limit="the wall clock, as a person looks",
-            remedy="Write --log run.db instead, and then undertow show run.db",
-        )
+    clock = "without it: it is for a run against the clock"
+    needs(not simulated, "with --simulated", clock, "worker", "lockstep", "supervisor")
+    needs(
+        not simulated, "with --simulated", "without it: a person looks by the clock", "watch",
+        remedy="Write --log run.db instead, and then undertow show run.db",
+    )  # fmt: skip
     processes = 3 if worker == "process" else 0
     forked = 0 if simulated else processes + supervisor + watch
     check_resources(processes=forked, log=log is not None)  # before a driver is opened
@@ -219,7 +213,8 @@ def run(
         verdict = report.verdict  # with the log closed
         show(f"Verdict: {verdict}.")
         if verdict.ending == "lost" and in_a_file(rig):
-            words = shlex.join(["undertow", "bench", name, "--rig", rig])
+            values = [word for value in setting or () for word in ("--set", value)]
+            words = shlex.join(["undertow", "bench", name, "--rig", rig, *values])
             show(f"If it never held: {words} checks signs, scales and delay, from rest.")
     exit_unless(not verdict.exit_code, verdict.exit_code)
 
@@ -394,8 +389,10 @@ def drill(
     """
     from undertow.studies import fault_injection
 
-    instead = f"{kills} kills, {'--systematic' if systematic else '--only'}"
-    require(kills is None or not (systematic or only), "--kills", instead, "one of them")
+    other = systematic or bool(only)
+    needs(not other, "with --systematic or --only", "one of them", "kills")
+    drills = "for the drill of single faults: those others are live or not by themselves"
+    needs(kills is None and not other, "with another drill", drills, "live")
     if systematic or only:
         _systematic(only or (), seed)
         return

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from undertow.base import InvalidInputError, check_folder, check_place, require_extra, write_file
+from undertow.base import check_folder, check_place, require_extra, write_file
 from undertow.cli import options
 from undertow.cli.parsing import mechanism_named, parse_start
-from undertow.cli.terminal import command, progress_bar
+from undertow.cli.terminal import command, needs, progress_bar
 from undertow.cli.terminal import show as say
 from undertow.models import Mechanism
 from undertow.models.importers.formats import file_words
@@ -114,23 +114,12 @@ def show(
         check_folder(save.parent, "--save")
         check_place(save, b"<!do")
     log = _is_log(name)
-    if mechanism is not None and not log:
-        raise InvalidInputError(
-            "--mechanism", value=mechanism, limit="for a log, FILE.db", remedy="Leave it out"
-        )
-    shown_as = {
-        "--start": ", ".join(start or ()), "--set": ", ".join(setting or ()),
-        "--limit": ", ".join(limit or ()), "--objective": objective if objective != USUAL else "",
-        "--period": f"{period:g} s" if period != 0.1 else "", "--seed": str(seed or ""),
-    }  # fmt: skip
-    for what, given in shown_as.items():
-        if log and given:
-            raise InvalidInputError(
-                f"{what} with a log",
-                value=given,
-                limit="for a mechanism: what a log shows has been",
-                remedy="Leave it out",
-            )
+    needs(log, "without a log", "for a log, FILE.db", "mechanism")
+    needs(
+        not log, "with a log", "for a mechanism: what a log shows has been",
+        "start", "setting", "limit", "objective", "period", "seed",
+    )  # fmt: skip
+    needs(save is None, "with --save", "for a page that is served", "port", "browser")
     shown: Show
     with progress_bar() as progress:
         if log:

@@ -10,6 +10,7 @@ import textwrap
 import time
 from collections.abc import Callable, Iterator, Mapping, Sized
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, ParamSpec, get_args, get_origin
@@ -25,6 +26,7 @@ import undertow
 from undertow.base import (
     INTERRUPTED,
     ArtefactError,
+    InvalidInputError,
     Progress,
     UndertowError,
     by_exception,
@@ -75,8 +77,36 @@ class _Plain:
             console.print(Text(textwrap.indent(f"{epilog}\n", " ")), soft_wrap=True)
 
 
+#: The command that is carried out, as its parser has it.
+_ASKED: ContextVar[Any] = ContextVar("the command that is carried out")
+
+
 class _Command(_Plain, TyperCommand):
-    pass
+    def invoke(self, ctx: Any) -> Any:
+        """Keep what was typed, for :func:`needs`."""
+        before = _ASKED.set(ctx)
+        try:
+            return super().invoke(ctx)
+        finally:
+            _ASKED.reset(before)
+
+
+def needs(used: bool, where: str, limit: str, *names: str, remedy: str = "Leave it out") -> None:
+    """Refuse options that were typed where nothing uses them, their defaults typed out, too.
+
+    ``names`` are those of the command's parameters; the error says what was typed and ``where``.
+    """
+    ctx = _ASKED.get()
+    for parameter in () if used else ctx.command.params:
+        name = parameter.name
+        if name not in names or ctx.get_parameter_source(name).name != "COMMANDLINE":
+            continue
+        value = ctx.params[name]
+        options = parameter.secondary_opts if value is False else parameter.opts
+        shown = ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+        shown = f"{value:g}" if isinstance(value, float) else shown
+        words = where if isinstance(value, bool) else f"{shown}, {where}"
+        raise InvalidInputError(options[0], value=words, limit=limit, remedy=remedy)
 
 
 class _Group(_Plain, TyperGroup):
@@ -232,7 +262,8 @@ def progress_bar() -> Iterator[Progress]:
     def told(what: str, part: float) -> str:
         """Add how long the rest takes, once enough is done to tell."""
         now = time.monotonic()
-        begun[:] = begun or [(part, now)]
+        if not begun or part <= begun[0][0]:  # what takes long before any of it is done counts not
+            begun[:] = [(part, now)]
         done = part - begun[0][0]
         if done < ENOUGH or part >= 1:
             return what

@@ -59,7 +59,8 @@ def trials(
     limits
         balance: also search for the catch limits, which takes longest. Default: yes.
     quick
-        Quick look: three seeds, ten random rigs, no search for limits; not for mujoco.
+        Quick look: three seeds, ten random rigs, no search for limits, where nothing else is said;
+        not for mujoco.
     fresh : SEED
         swing-up: search for new gains with this seed, in place of the library's.
     out
@@ -90,7 +91,6 @@ def trials(
     if angle is not None:
         asked["angle"] = math.radians(angle)
     if asked.pop("quick", False):
-        brief: dict[str, Any] = {"seeds": min(seeds or 3, 3), "rigs": min(rigs or 10, 10)}
-        brief |= {"single": False, "limits": False}
-        asked |= {option: brief[option] for option in takes[what] & {*brief}}
+        brief: dict[str, Any] = {"seeds": 3, "rigs": 10, "single": False, "limits": False}
+        asked = {option: brief[option] for option in takes[what] & {*brief}} | asked
     carry_out(EXPERIMENTS[what](**asked), out)

@@ -208,11 +208,7 @@ class ClosedLoop:
             object.__setattr__(self, "covariance", covariance)
         at_least("threads of a closed loop", self.threads, 1, "1 is the calling thread alone")
         positive("rollout step, s", self.step)
-        self.reaching.check_period(
-            "sample period of the inner loop" if self.zoh_steps else "rollout step",
-            self.step * max(1, self.zoh_steps),
-            self.mechanism.m,
-        )
+        self._check_law(self.reaching)
         if self.plant is not None and self.ensemble is not None:
             raise InvalidInputError(
                 "plant of a closed loop",
@@ -221,6 +217,11 @@ class ClosedLoop:
                 remedy="Leave one of them out",
             )
         self.mechanism.check_plant(self.truth)
+
+    def _check_law(self, law: ReachingLaw) -> None:
+        """Refuse a reaching law whose layer the steps, or samples, of the inner loop cross."""
+        what = "sample period of the inner loop" if self.zoh_steps else "rollout step"
+        law.check_period(what, self._period, self.mechanism.m)
 
     def __repr__(self) -> str:
         """Show belief, truth where it is another one, and objective."""
@@ -766,8 +767,9 @@ class ClosedLoop:
                 terminal=terminal, every=every, noise=noise,
             )  # fmt: skip
         plan = Plan.of(surfaces, switch_times)
-        for surface in plan.surfaces:
+        for surface, law in zip(plan.surfaces, plan.laws(self.reaching), strict=True):
             check_surface_shape(self.mechanism, surface)
+            self._check_law(law)
         if noise is not None:
             if not self.zoh_steps:
                 raise InvalidInputError(

@@ -416,7 +416,8 @@ class Objective:
             ends: Any = box.formula
             if self.travel:
                 check_travel(mechanism, state, ends.low, ends.high, box.name)
-            _warn_of_degrees(mechanism, state, max(-ends.low, ends.high))
+            if not box.source:  # somebody's own numbers
+                _warn_of_degrees(mechanism, state, max(-ends.low, ends.high))
         constraints = own + declared
         self._check_terminal_set(mechanism, constraints)
         return self if constraints == self.constraints else replace(self, constraints=constraints)

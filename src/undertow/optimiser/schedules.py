@@ -8,7 +8,7 @@ they lead it to the target again, all its surfaces together.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from undertow.closed_loop import INADMISSIBLE, RolloutBuffers
+from undertow.closed_loop.trajectory import Batch
 from undertow.law import Plan
 from undertow.models import FloatArray
 from undertow.optimiser.arrival import ArrivalSearch
@@ -99,7 +100,7 @@ def _follow(task: Optimisation, motion: OpenLoopMotion, keep: int) -> None:
     """
     if motion.time < (1.0 - WORTHWHILE) * task.best_cost - task.resolution:
         for _ in range(TRIES):
-            plan = _schedule(task, earliest_arrival(task, keep), motion)
+            plan = _schedule(task, earliest_arrival(task, keep), motion, keep)
             if plan is not None:
                 task.consider(plan)
                 lead_back(task, plan)
@@ -180,11 +181,13 @@ def _ended(task: Optimisation, plan: Plan, arrives: float) -> Plan:
     return Plan(plan.surfaces[:count] + anchor.surfaces, (*plan.times[:count], end), laws)
 
 
-def _schedule(task: Optimisation, arrival: EarliestArrival, motion: OpenLoopMotion) -> Plan | None:
+def _schedule(
+    task: Optimisation, arrival: EarliestArrival, motion: OpenLoopMotion, keep: int
+) -> Plan | None:
     """Return surfaces that follow a motion, the last but one of which arrives.
 
     From the next multiple of the period on the first design takes over: that is stable, as the
-    last surface of a plan must be.
+    last surface of a plan must be.  So many evaluations are left over.
     """
     loop, space, period = task.loop, task.space, task.optimiser.freedom.schedule
     m = loop.mechanism.m
@@ -197,14 +200,24 @@ def _schedule(task: Optimisation, arrival: EarliestArrival, motion: OpenLoopMoti
             z[: len(near)] = before + space.steps(task.rng, near)
         return np.asarray(z)
 
+    def afforded(roll_out: Callable[[FloatArray], Batch], z: FloatArray, time: float) -> FloatArray:
+        """States at the end, (N, 2n): infinite for those that the budget has no room for."""
+        each, found = time / motion.time, np.full((len(z), 2 * loop.mechanism.n), np.inf)
+        z = z[: max(0, math.floor((task.left - keep) / each))]
+        task.evaluations += math.ceil(len(z) * each)
+        if len(z):
+            found[: len(z)] = ends(roll_out(z))
+        return found
+
     def states(x: FloatArray, z: FloatArray, time: float) -> FloatArray:
-        task.evaluations += math.ceil(len(z) * time / motion.time)
-        buffers = RolloutBuffers(loop, len(z), 1).fill(x, *space.decode(z))
-        return ends(loop.roll_out(buffers, (0.0,), time, terminal=0.0))
+        def roll_out(z: FloatArray) -> Batch:
+            buffers = RolloutBuffers(loop, len(z), 1).fill(x, *space.decode(z))
+            return loop.roll_out(buffers, (0.0,), time, terminal=0.0)
+
+        return afforded(roll_out, z, time)
 
     def exact(x: FloatArray, z: FloatArray, time: float) -> FloatArray:
-        task.evaluations += math.ceil(len(z) * time / motion.time)
-        return ends(space.batch(x, z, duration=time, terminal=0.0, precise=True))
+        return afforded(partial(space.batch, x, duration=time, terminal=0.0, precise=True), z, time)
 
     fit = partial(fits, space, task.optimiser.anchor)
     follower = Follower(draw, fit, states, exact, arrival, period, loop.step)

@@ -26,7 +26,7 @@ from undertow.models.importers.python_file import object_from_file
 
 
 class OutputOnError(OSError):
-    """Raised by a rig that is closed and knows that its inputs are not at zero."""
+    """Raised by a rig that is closed where its inputs are not at zero, or may not be."""
 
 
 @dataclass(slots=True, eq=False)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -30,6 +30,9 @@ _UNITS = {
 
 #: What of an answer of the slow loop is shown; all of it is in the log alone.
 _ANSWER = tuple(name for name in ANSWERS if name not in ("k", "body"))
+
+#: Units of that; costs have that of the objective.
+_OF_ANSWERS = {"use": "s", "seconds": "s"}
 
 #: Foxglove's schema of a line of text, for the panel that shows them; 2 is information, 4 an error.
 _LINE = {
@@ -79,7 +82,8 @@ def to_parquet(recording: Recording, path: str | Path) -> Path:
     """Write a log as one Parquet file, and return where it is.
 
     A column a quantity, a row a step; each field's metadata has its ``unit``.  The table's
-    metadata ``undertow`` is JSON: ``meta``, ``events`` and ``answers`` of the log.
+    metadata ``undertow`` is JSON: ``meta``, ``events`` and ``answers`` of the log, null for what is
+    not finite.
 
     Parameters
     ----------
@@ -117,7 +121,7 @@ def to_mcap(recording: Recording, path: str | Path) -> Path:
     Channels with JSON messages and their JSON schemas, one message a step: ``/state``,
     ``/measured``, ``/input``, ``/demand``, ``/surface`` and ``/loop``; ``/answers`` of the slow
     loop, and ``/events`` as lines of text.  What is not a number is left out.  The log's ``meta``
-    is in the file's metadata ``undertow``.
+    is in the file's metadata ``undertow``, null for what is not finite.
 
     Parameters
     ----------
@@ -155,7 +159,8 @@ def _write_mcap(writer: Any, recording: Recording) -> None:
          [(name, place[name]) for name in names])
         for topic, names in groups.items()
     ]  # fmt: skip
-    answers = channel("/answers", _numbers({"k": "", **dict.fromkeys(_ANSWER, "")}, loose=True))
+    of_answers = {"k": "", **dict.fromkeys(_ANSWER, ""), **_OF_ANSWERS}
+    answers = channel("/answers", _numbers(of_answers, loose=True))
     events = channel("/events", _LINE)
     lines = sorted(_lines(recording, answers, events), key=lambda line: line[0])
     ahead = 0
@@ -199,7 +204,7 @@ def _lines(
 
 
 def _says(value: object) -> bool:
-    """Whether JSON has a word for a value: it has none for NaN and infinities."""
+    """Whether a value says something: nothing, NaN and infinities do not."""
     return value is not None and (not isinstance(value, float) or math.isfinite(value))
 
 
@@ -211,12 +216,19 @@ def _message(writer: Any, sequence: int, t: float, channel: int, said: dict[str,
 
 
 def _json(value: object) -> str:
-    return json.dumps(value, ensure_ascii=False, default=_plain)
+    return json.dumps(_plain(value), ensure_ascii=False, allow_nan=False)
 
 
 def _plain(value: Any) -> Any:
-    """Return numbers of NumPy as Python's."""
-    return value.item() if isinstance(value, np.generic) else str(value)
+    """Return a value as JSON has it: null for NaN and infinities, for which that has no word."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    value = value.item() if isinstance(value, np.generic) else value
+    if not _says(value):
+        return None
+    return value if isinstance(value, str | int | float) else str(value)
 
 
 def _written(path: Path, begins: bytes, write: Callable[[BinaryIO], None]) -> Path:

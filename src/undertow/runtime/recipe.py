@@ -247,16 +247,20 @@ class Recipe:
         """The cascade as it is for exact states."""
         design = self.design
         if design is not None:
+            goal = self.settings.bounded(design.objective, self._whole)
+            if goal is not design.objective:
+                design = replace(design, objective=goal)
             if (design.mechanism.input_limits == self.belief.input_limits).all():
                 return design
             about = design.belief
             if isinstance(about, Belief):
                 about = replace(about, mechanism=self.belief)
             return replace(design, mechanism=self.belief, belief=about)
-        goal = self.objective
-        if not isinstance(goal, Objective):
-            goal = objective_for(self._whole, goal, horizon=self.horizon)
+        wanted = self.objective
+        if not isinstance(wanted, Objective):
+            wanted = objective_for(self._whole, wanted, horizon=self.horizon)
         known: Literal["usual", "exact"] = "usual" if self.learns else "exact"
+        goal = self.settings.bounded(wanted, self._whole)
         return Cascade(self.belief, goal, seed=self.seed, belief=known)
 
     @cached_property

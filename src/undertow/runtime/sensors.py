@@ -219,7 +219,7 @@ class SensorMonitor:
 
     def forget(self) -> None:
         """Start afresh: the next sound reading is the first."""
-        self.missing, self.first, self.probe = 0, False, 0.0
+        self.missing, self.first, self.probe, self._silent = 0, False, 0.0, False
         self._clock[:] = 0.0
         self._clock[[RIG_SOUND, RIG_LAST]] = -math.inf
         self._gaps[:] = self._ages[:] = self._quiet[:] = self._shares[:] = 0.0
@@ -242,6 +242,7 @@ class SensorMonitor:
             if measurement.v is not None:
                 copy_numbers(measurement.v, self._v, "measured v")
             accepted.v = None if measurement.v is None else self._v
+        self._silent = math.isnan(stamp) and all(map(math.isnan, self._q))
         found, where, self.missing, self.first, accepted.t, self.probe = self._check(
             stamp, x, u, self._block
         )
@@ -255,6 +256,8 @@ class SensorMonitor:
             return f"sensor '{self.names[where]}' lost for {1e3 * self._gaps[where]:.0f} ms"
         if found == TIMELESS:
             gap, last = self._clock[NOW] - self._clock[OUR_SOUND], self._clock[RIG_LAST]
+            if self._silent:
+                return f"no sensor gave anything for {1e3 * gap:.0f} ms, last at {last:g} s"
             return (
                 f"the rig's clock made no sense for {1e3 * gap:.0f} ms, last at {last:g} s: "
                 "the time of a reading must be later than the last one's, by "

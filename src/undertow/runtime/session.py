@@ -230,7 +230,9 @@ def run(
         :class:`undertow.plants.Rig`.  By default a simulated one with friction, encoders and
         delay.  It is closed at the end.
     seconds
-        Length of the run, s; then the output is brought to zero.
+        Length of the run, s; then the output is brought to zero.  No plan is to arrive by then: on
+        a rig each looks the whole horizon of the objective ahead, however long the run goes on,
+        where :meth:`undertow.Cascade.simulate` and :func:`undertow.policy` count what is left.
     x0
         Where the mechanism is held at the start, (2n,), or its non-zero entries by name
         (``phi=0.7``).  With neither, the mechanism's usual ``start``.

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from undertow.base import check_fields, positive
 from undertow.models import FloatArray, Mechanism
+from undertow.objective import TRAVEL, Objective, state_box
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,8 @@ class Settings:
         det Γ(q)/det Γ(0) below which the law is taken to be lost, (37).
     max_travel
         Largest |q_i|, rad or m, besides the ranges of the coordinates: where a run is stopped.
-        Plans keep to the ranges alone.
+        Plans keep within 95 % of it, as of the ranges; free angles beyond ``fall_angle`` have
+        fallen before.  A bound makes searches some four times as long.
     fall_angle
         A free angle further than this from the target has fallen, rad; with a swing-up one further
         than 60° in any case.
@@ -117,6 +119,22 @@ class Settings:
     def limits(self, mechanism: Mechanism) -> FloatArray:
         """Largest |u_i|, (m,)."""
         return np.minimum(mechanism.input_limits, self.output_limit)
+
+    def bounded(self, objective: Objective, mechanism: Mechanism) -> Objective:
+        """Return an objective whose motions keep to ``max_travel``, where that is less than ranges.
+
+        To 95 % of it, as to those of the travel that a mechanism declares; free angles only where
+        they have not fallen before.
+        """
+        boxes, source = [], f"{100 * TRAVEL:g} % of Settings(max_travel={self.max_travel:g})"
+        for i, (low, high) in enumerate((TRAVEL * self.travels(mechanism)).tolist()):
+            c = mechanism.coordinates[i]
+            falls = self.fall_angle if i >= mechanism.m and c.unit == "rad" else math.inf
+            if self.max_travel < min(max(-c.low, c.high), falls):
+                (box,) = state_box(**{c.name: (low, high)})
+                boxes.append(replace(box, unit=c.unit, source=source))
+        constraints = (*objective.constraints, *boxes)
+        return replace(objective, constraints=constraints) if boxes else objective
 
     def slew(self, mechanism: Mechanism) -> FloatArray:
         """Largest |du_i/dt|, (m,), in the input's unit per second."""

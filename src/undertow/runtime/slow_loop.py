@@ -158,8 +158,7 @@ def _retarget(cascade: Cascade, request: Request, x: FloatArray, began: float) -
     try:
         place = memory.absolute(use, x)
         after, proposal = cascade.start_to(place, request.target, use, memory)
-        if not after.after_jump:
-            after = cascade.prepared(after, place)
+        after = cascade.prepared(after, place)
         admission = Admission(True, "first optimum for another target", after.predicted)
         answer = _answer(
             request, after.error(use, place), proposal, after, admission,

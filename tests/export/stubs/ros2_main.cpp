@@ -1,5 +1,5 @@
 // A stand-in for the controller manager: it takes a controller through its life in the manager's
-// order. Arguments: update rate, "positions" or "velocities", the joints. Each line of numbers is
+// order. Arguments: update rate, and after a colon the manager's own, Hz; "positions" or "velocities", the joints. Each line of numbers is
 // one period's states; the answer is the commands, and at the end those after deactivation.
 #include <cmath>
 #include <cstdlib>
@@ -34,7 +34,9 @@ int main(int count, char ** words)
   using controller_interface::CallbackReturn;
   const std::unique_ptr<controller_interface::ControllerInterface> made(stub_make());
   std::map<std::string, double> hardware;
+  const std::string rates = words[1];
   made->rate = static_cast<unsigned int>(std::atoi(words[1]));
+  const double real = std::atof(rates.substr(rates.find(':') + 1).c_str());
   if (made->on_init() != CallbackReturn::SUCCESS) {
     return 3;
   }
@@ -60,9 +62,11 @@ int main(int count, char ** words)
       }
       (void)state.set_value(std::atof(number.c_str()));
     }
-    if (made->update({}, {}) != controller_interface::return_type::OK) {
+    const bool sound =
+      made->update({}, rclcpp::Duration(1 / real)) == controller_interface::return_type::OK;
+    show(made->command_interfaces_);
+    if (!sound) {
       return 5;
     }
-    show(made->command_interfaces_);
   }
 }

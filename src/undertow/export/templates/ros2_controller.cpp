@@ -35,7 +35,7 @@ CallbackReturn Controller::on_configure(const rclcpp_lifecycle::State &)
       joints_.size(), UT_N);
     return CallbackReturn::ERROR;
   }
-  // 0: the controller runs at the manager's rate, which update() then sees.
+  // 0: the controller runs at the manager's rate, which update() then looks at.
   const double rate = static_cast<double>(get_update_rate());
   if (rate > 0 && std::fabs(rate * static_cast<double>(UT_PERIOD) - 1) > 1e-3) {
     RCLCPP_ERROR(
@@ -76,6 +76,9 @@ CallbackReturn Controller::on_activate(const rclcpp_lifecycle::State &)
 {
   ut_init(&controller_);
   status_ = UT_OK;
+  periods_ = 0;
+  elapsed_ = 0;
+  out_of_step_ = false;
   return CallbackReturn::SUCCESS;
 }
 
@@ -86,8 +89,29 @@ CallbackReturn Controller::on_deactivate(const rclcpp_lifecycle::State &)
   return CallbackReturn::SUCCESS;
 }
 
-return_type Controller::update(const rclcpp::Time &, const rclcpp::Duration &)
+return_type Controller::update(const rclcpp::Time &, const rclcpp::Duration & period)
 {
+  // Whatever rate was asked for: one step of the C is one period.
+  constexpr int watched = 100;
+  constexpr double most = 0.1;
+  elapsed_ += period.seconds();
+  if (++periods_ == watched) {
+    const double mean = elapsed_ / watched;
+    periods_ = 0;
+    elapsed_ = 0;
+    if (!(std::fabs(mean / static_cast<double>(UT_PERIOD) - 1) <= most)) {
+      out_of_step_ = true;
+      RCLCPP_ERROR(
+        get_node()->get_logger(), "period: got %g s, the mean of %d, must be %g s to a tenth: set "
+        "update_rate, or export with another --period; the output is zero until the controller is "
+        "activated again", mean, watched, static_cast<double>(UT_PERIOD));
+    }
+  }
+  if (out_of_step_) {
+    const ut_real nothing[UT_M] = {};
+    command(nothing);
+    return return_type::ERROR;
+  }
   ut_real x[UT_X] = {};
   ut_real u[UT_M];
   for (size_t i = 0; i < state_interfaces_.size() && i < UT_X; i++) {

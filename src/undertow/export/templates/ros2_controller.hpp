@@ -31,6 +31,9 @@ private:
   std::string command_interface_;
   bool use_velocities_ = false;
   int status_ = UT_OK;
+  int periods_ = 0;
+  double elapsed_ = 0;
+  bool out_of_step_ = false;
   ut_controller controller_;
 };
 

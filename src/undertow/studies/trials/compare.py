@@ -187,7 +187,7 @@ def compare(
         Initial state, (2n,), or its non-zero entries by name (``phi=0.7``).  With neither, the
         mechanism's usual ``start``.
     seconds
-        Length of a run, s.
+        Length of a run, s.  As with :func:`undertow.run` no plan is to arrive by its end.
     seed
         Of the benches.
 

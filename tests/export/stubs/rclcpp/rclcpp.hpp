@@ -11,7 +11,15 @@
 namespace rclcpp
 {
 class Time {};
-class Duration {};
+class Duration
+{
+public:
+  explicit Duration(double seconds) : seconds_(seconds) {}
+  double seconds() const { return seconds_; }
+
+private:
+  double seconds_;
+};
 class Logger {};
 
 class Parameter
