@@ -12,7 +12,7 @@ from undertow.symbolic.function import COMPILED, PREAMBLE, function_source, scal
 from undertow.symbolic.machine import compiled, numba, processor
 from undertow.symbolic.names import distinct, docstring
 from undertow.symbolic.scalar import Emitter
-from undertow.symbolic.single_assignment import SELECT, single_assignment
+from undertow.symbolic.single_assignment import PRIMITIVES, single_assignment
 from undertow.symbolic.store import (
     content_key,
     generated,
@@ -29,7 +29,7 @@ __all__ = [
     "BRIEF",
     "COMPILED",
     "PREAMBLE",
-    "SELECT",
+    "PRIMITIVES",
     "C99Emitter",
     "Emitter",
     "Real",
