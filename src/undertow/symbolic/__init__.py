@@ -12,7 +12,7 @@ from undertow.symbolic.function import COMPILED, PREAMBLE, function_source, scal
 from undertow.symbolic.machine import compiled, numba, processor
 from undertow.symbolic.names import distinct, docstring
 from undertow.symbolic.scalar import Emitter
-from undertow.symbolic.single_assignment import PRIMITIVES, single_assignment
+from undertow.symbolic.single_assignment import PRIMITIVES, Straight, single_assignment
 from undertow.symbolic.store import (
     content_key,
     generated,
@@ -33,6 +33,7 @@ __all__ = [
     "C99Emitter",
     "Emitter",
     "Real",
+    "Straight",
     "Tape",
     "Workspace",
     "compile_expressions",
