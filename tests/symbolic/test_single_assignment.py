@@ -6,11 +6,11 @@ import ast
 
 import numpy as np
 
-from undertow.symbolic import SELECT, load_module, single_assignment
+from undertow.symbolic import PRIMITIVES, load_module, single_assignment
 
 SOURCE = f"""import math
 import numba
-{SELECT}
+{PRIMITIVES}
 
 @numba.njit
 def straight(x, out):
@@ -34,7 +34,7 @@ def straight(x, out):
 def test_values_stay() -> None:
     """In compiled code as in plain Python: sums, the largest, exchanged names, and arrays."""
     plain: dict[str, object] = {}
-    exec(SOURCE.replace("@numba.njit", "").replace(SELECT, ""), plain)
+    exec(SOURCE.replace("@numba.njit", "").replace(PRIMITIVES, ""), plain)
     compiled = load_module("straight", single_assignment(SOURCE)).straight
     x = np.array([0.5, -1.0, 2.5, 4.0, -0.25])
     first, second = np.ones(5), np.ones(5)
@@ -52,3 +52,24 @@ def test_names_of_a_loop_are_assigned_once() -> None:
     ]
     assert {name for name in stored if stored.count(name) > 1} == {"total", "last", "kept"}
     assert not any(isinstance(node, ast.IfExp | ast.BoolOp) for node in ast.walk(tree))
+
+
+def test_memory_holds_numbers_until_a_function_returns() -> None:
+    """In compiled code as in plain Python, two of them apart."""
+    source = f"""import numba
+{PRIMITIVES}
+
+@numba.njit(pipeline_class=Straight)
+def turned(x):
+    first, second, total = memory(24), memory(3), 0.0
+    for i in range(24):
+        first[i] = x[i]
+    for i in range(3):
+        second[i] = -1.0
+    for i in range(24):
+        total += first[23 - i] * x[i] + second[i % 3]
+    return total
+"""
+    module = load_module("memory", source)
+    x = np.arange(24.0)
+    assert module.turned(x) == module.turned.py_func(x) == x @ x[::-1] - 24

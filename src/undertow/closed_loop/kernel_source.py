@@ -31,7 +31,7 @@ from undertow.closed_loop.work_array import (
     entrance,
     total,
 )
-from undertow.symbolic import SELECT, Emitter, distinct, docstring, single_assignment
+from undertow.symbolic import PRIMITIVES, Emitter, distinct, docstring, single_assignment
 
 #: Whether a lane may hand over is looked at in these intervals, s.
 WATCH = 0.032
@@ -432,11 +432,11 @@ def kernel_source(program: LoopGraph, *, header: str) -> str:
 
 import numba
 import numpy as np
-{SELECT}
+{PRIMITIVES}
 
 @numba.njit(
     cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True,
-    fastmath={{"contract", "nsz", "arcp"}},
+    pipeline_class=Straight, fastmath={{"contract", "nsz", "arcp"}},
 )
 def rollout(
     from_lane, to_lane, x0, live, lanes, switch, plant, belief, limits, noise,
@@ -499,7 +499,7 @@ def _etd_integrate(w: _Writer) -> str:
 
 @numba.njit(
     cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True,
-    fastmath={{"contract", "nsz", "arcp"}},
+    pipeline_class=Straight, fastmath={{"contract", "nsz", "arcp"}},
 )
 def etd_integrate(
     from_lane, to_lane, lanes, plant, belief, limits, until, terminal, escape, tail, counted,

@@ -13,7 +13,7 @@ from functools import lru_cache
 from types import ModuleType
 
 from undertow.closed_loop.work_array import LANES
-from undertow.symbolic import SELECT, content_key, generated, single_assignment
+from undertow.symbolic import PRIMITIVES, content_key, generated, single_assignment
 
 #: Time of the first stored power e^{At}, s; level k stands for 2ᵏ units.
 UNIT = 0.005
@@ -56,14 +56,11 @@ def _source(N: int) -> str:
     ]
     source = f'''"""Linear systems of order {N}; generated, do not edit."""
 
-import math
-
 import numba
-import numpy as np
-{SELECT}
+{PRIMITIVES}
 inner = numba.njit(
     cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True,
-    fastmath={{"contract", "nsz", "arcp"}},
+    pipeline_class=Straight, fastmath={{"contract", "nsz", "arcp"}},
 )
 
 
@@ -81,12 +78,18 @@ def _turned(a, b, add, o):
 {_indented(turned)}
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
+@numba.njit(
+    cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True, pipeline_class=Straight,
+)
 def double(A, Q, P, stable, powers, forced):
     half = {N // 2}
-    W = np.zeros((12, {area}))
-    zero, one, scaled, E, X, T = W[0], W[1], W[2], W[3], W[4], W[5]
-    U, V, Z, F, G, Y = W[6], W[7], W[8], W[9], W[10], W[11]
+    zero, one, scaled = memory({area}), memory({area}), memory({area})
+    E, X, T = memory({area}), memory({area}), memory({area})
+    U, V, Z = memory({area}), memory({area}), memory({area})
+    F, G, Y = memory({area}), memory({area}), memory({area})
+    for e in range({area}):
+        zero[e] = 0.0
+        one[e] = 0.0
     for r in range({N}):
         for i in range({LANES}):
             one[(r * {N} + r) * {LANES} + i] = 1.0

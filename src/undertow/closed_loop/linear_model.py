@@ -204,9 +204,9 @@ class TerminalLinearModel:
         not η_i. ``into``: what is filled, see :meth:`buffers`. ``member``: which plant of the
         ensemble each lane has, (C,).
         """
-        stage = self._weights
+        stage, known = self._weights, _SAME if gains is None else np.ascontiguousarray(gains)
         _close(
-            lanes, self._layout.starts, _SAME if gains is None else gains, self.X, self.Y, self.H,
+            lanes, self._layout.starts, known, self.X, self.Y, self.H,
             self.S, self.B_inverse, stage.xx, stage.xu, stage.uu, self.counts_cost, member,
             *self._plants, into.A, into.Q, into.feedback,
         )  # fmt: skip

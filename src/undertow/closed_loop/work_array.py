@@ -95,12 +95,8 @@ class WorkArray:
         return [f"W[{(start + j) * GROUPS * LANES} + i]" for j in range(rows)]
 
     def allocate(self) -> str:
-        """Return the lines that make the array, from the beginning of a cache line on."""
-        size = self.count * GROUPS * LANES
-        return f"""\
-    W = np.empty({size + 8})
-    skip = -(W.ctypes.data // 8) % 8
-    W = W[skip : skip + {size}]"""
+        """Return the line that makes the array."""
+        return f"    W = memory({self.count * GROUPS * LANES})"
 
 
 def entry(matrix: Sequence[Sequence[str]]) -> str:

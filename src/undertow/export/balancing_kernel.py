@@ -17,7 +17,7 @@ from undertow.closed_loop import LANES
 from undertow.models import TIME, Mechanism
 from undertow.objective import Objective
 from undertow.symbolic import (
-    SELECT,
+    PRIMITIVES,
     Emitter,
     Tape,
     content_key,
@@ -109,19 +109,17 @@ def _source(mechanism: Mechanism, stage: sp.Expr, margins: list[sp.Expr], header
 
 import numba
 import numpy as np
-{SELECT}
+{PRIMITIVES}
 
 @numba.njit(
     cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True,
-    fastmath={{"contract", "nsz", "arcp"}},
+    pipeline_class=Straight, fastmath={{"contract", "nsz", "arcp"}},
 )
 def advance(x, u, t, cost, margin, plant, h, steps):
 {_lines(constants, 1)}
     weights, reaches, places = {table}
     sixth = h / 6.0
-    W = np.empty({len(rows) * LANES + 8})
-    skip = -(W.ctypes.data // 8) % 8
-    W = W[skip : skip + {len(rows) * LANES}]
+    W = memory({len(rows) * LANES})
     for b in range(0, x.shape[1], {LANES}):
 {_loop(take, 2)}
         for step in range(steps):

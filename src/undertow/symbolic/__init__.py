@@ -12,7 +12,7 @@ from undertow.symbolic.function import COMPILED, PREAMBLE, function_source, scal
 from undertow.symbolic.machine import compiled, numba, processor
 from undertow.symbolic.names import distinct, docstring
 from undertow.symbolic.scalar import Emitter
-from undertow.symbolic.single_assignment import SELECT, single_assignment
+from undertow.symbolic.single_assignment import PRIMITIVES, Straight, single_assignment
 from undertow.symbolic.store import (
     content_key,
     generated,
@@ -29,10 +29,11 @@ __all__ = [
     "BRIEF",
     "COMPILED",
     "PREAMBLE",
-    "SELECT",
+    "PRIMITIVES",
     "C99Emitter",
     "Emitter",
     "Real",
+    "Straight",
     "Tape",
     "Workspace",
     "compile_expressions",

@@ -286,7 +286,7 @@ def _word(name: str) -> str:
 
 def _dropped(target: ast.expr) -> bool:
     """Whether an assignment only makes the work array."""
-    return isinstance(target, ast.Name) and target.id in {"W", "skip"}
+    return isinstance(target, ast.Name) and target.id == "W"
 
 
 def _pairs(target: ast.expr, value: ast.expr) -> list[tuple[ast.expr, ast.expr]]:

@@ -3,7 +3,8 @@
 For a name that is assigned twice, anywhere in a function, numba goes through the whole function
 again, and so it does for each ``a if c else b``, which it takes for a branch.  Here every
 assignment makes a name of its own, and a choice is a call of :func:`select`.  The values stay the
-same.
+same.  What the loops work on is no array but :func:`memory` of the function's own: to find one
+element of an array takes numba many instructions, which LLVM has to take away again.
 """
 
 from __future__ import annotations
@@ -13,10 +14,33 @@ from collections.abc import Iterator
 from itertools import count
 from typing import Any, TypeGuard, cast
 
+import numpy as np
+from llvmlite import ir
+from numba.core import compiler as numba_compiler
+
 from undertow.symbolic.machine import numba
 
 #: What a module imports whose loops were rewritten.
-SELECT = "from undertow.symbolic.single_assignment import select\n"
+PRIMITIVES = "from undertow.symbolic.single_assignment import Straight, memory, select\n"
+
+#: Modules without types.
+compiler: Any = numba_compiler
+llvm: Any = ir
+types: Any = numba.types
+
+
+class Straight(compiler.CompilerBase):  # type: ignore[misc]
+    """numba's compiler without what looks for closures and sums of whole arrays: there are none."""
+
+    LEFT_OUT = "InlineClosureLikes", "GenericRewrites", "NopythonRewrites"
+
+    def define_pipelines(self) -> list[Any]:
+        """Return the one list of its passes."""
+        usual = compiler.DefaultPassBuilder.define_nopython_pipeline(self.state).passes
+        passes = compiler.PassManager("straight")
+        passes.passes = [each for each in usual if each[0].__name__ not in self.LEFT_OUT]
+        passes.finalize()
+        return [passes]
 
 
 def select(condition: Any, yes: Any, no: Any) -> Any:
@@ -28,18 +52,43 @@ def select(condition: Any, yes: Any, no: Any) -> Any:
 def _type_of_select(context):  # type: ignore[no-untyped-def]
     def typed(condition, yes, no):  # type: ignore[no-untyped-def]
         kind = context.unify_types(yes, no)
-        return kind(numba.types.boolean, kind, kind)
+        return kind(types.boolean, kind, kind)
 
     return typed
 
 
 #: For any types: what :func:`_type_of_select` lets through.
-_ANY = (numba.types.boolean, numba.types.Any, numba.types.Any)
+_ANY = (types.boolean, types.Any, types.Any)
 
 
 @numba.extending.lower_builtin(select, *_ANY)  # type: ignore[no-untyped-call]
 def _generate_select(_context, builder, _signature, values):  # type: ignore[no-untyped-def]
     return builder.select(*values)
+
+
+def memory(size: int) -> Any:
+    """Return room for so many numbers, a constant: in compiled code until the function returns.
+
+    It lies on the stack, from the beginning of a cache line on.
+    """
+    return np.empty(size)
+
+
+@numba.extending.type_callable(memory)
+def _type_of_memory(context):  # type: ignore[no-untyped-def]
+    def typed(size):  # type: ignore[no-untyped-def]
+        return types.CPointer(types.float64) if isinstance(size, types.IntegerLiteral) else None
+
+    return typed
+
+
+@numba.extending.lower_builtin(memory, types.IntegerLiteral)  # type: ignore[no-untyped-call]
+def _make_memory(_context, builder, signature, _values):  # type: ignore[no-untyped-def]
+    kind = llvm.ArrayType(llvm.DoubleType(), signature.args[0].literal_value)
+    with builder.goto_entry_block():
+        room = builder.alloca(kind)
+    room.align = 64
+    return builder.bitcast(room, llvm.DoubleType().as_pointer())
 
 
 def single_assignment(source: str) -> str:
