@@ -169,12 +169,12 @@ def test_what_takes_over_after_a_jump_is_chosen_anew_for_another_target(
 ) -> None:
     """It stayed what had been chosen on the way to the first target."""
     stale, x = ut.Plan.of(cascade.optimiser.anchor), CRANE.state(theta=0.05)
-    memory = replace(CascadeState(stale), after_jump=stale)
+    memory = replace(CascadeState(stale), after_jump=((math.inf, stale),))
     there = ReferenceMotion.at_rest(np.array([0.5, 0.0]))
     answer = respond(cascade, Request(0.0, x, 0.0, memory, target=there))
     assert answer.jump
-    assert answer.memory.after_jump is not stale
-    afresh = replace(answer.memory, after_jump=None)
+    assert answer.memory.after_jump != memory.after_jump
+    afresh = replace(answer.memory, after_jump=())
     assert answer.memory.after_jump == cascade.prepared(afresh, x).after_jump
 
 

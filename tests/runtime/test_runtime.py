@@ -42,7 +42,7 @@ from undertow.runtime.encoding import answer_from, answer_row
 from undertow.runtime.log import ANSWERS
 from undertow.runtime.modes import Reason, transition
 from undertow.runtime.session import session
-from undertow.runtime.slow_loop import Answer, LeadTime, Request, next_of_swing
+from undertow.runtime.slow_loop import Answer, LeadTime, Request, law_vectors_of, next_of_swing
 from undertow.studies.fault_injection.cases import OutputMonitor
 
 #: A run from hanging: its surfaces, and the regions where they catch, are computed once for all.
@@ -381,8 +381,7 @@ def answered(request: Request, surface: ut.Surface) -> Answer:
     honest = respond(RECIPE.cascade, request)
     after = replace(request.memory, plan=plan, since=request.use, sequence=request.sequence)
     admission = Admission(True, "for the test", 1.0)
-    law_vectors = honest.law_vectors.copy()
-    law_vectors[0, : len(surface.vector)] = surface.vector
+    law_vectors = law_vectors_of(RECIPE.cascade, after)
     return replace(honest, admission=admission, memory=after, law_vectors=law_vectors)
 
 

@@ -200,7 +200,9 @@ class Planning:
         if belief is not None and estimate is not None:
             loops.insert(0, whole.believing(whole.mechanism, belief.alone(estimate)))
         free = planners.optimiser.freedom
-        gently = (free.reaching or free.rate) and not planners.optimiser.counts_time
+        gently = (
+            free.reaching or planners.optimiser.space.rate
+        ) and not planners.optimiser.counts_time
         if planners.recourse and (free.schedule or gently):
             loops.insert(0, predictions.estimated(estimate))
 
@@ -255,7 +257,7 @@ class Planning:
             near: list[Proposal] = []
             # A planner of one's own has no recourse, and is not told.
             less: dict[str, Any] = {"part": LAST} if self._hurries else {}
-            if planners.own is None and planners.optimiser.freedom.rate:
+            if planners.own is None and planners.optimiser.space.rate:
                 less["admits"] = partial(judge.frees, state, loop)
             for ask in asks:
                 for plan in [standing] if standing is used else [standing, used]:

@@ -118,7 +118,10 @@ class SearchSpace:
         self._fastest = 0.8 / (loop.step * max(1, loop.zoh_steps))
         eta, layer = loop.reaching.per_surface(m)
         self._eta, self._highest = eta, eta / layer
-        self._lowest = np.minimum(max(SLOWEST, FASTER * growth_rate(loop.mechanism)), self._highest)
+        slowest = max(SLOWEST, FASTER * growth_rate(loop.mechanism)) if freedom.rate else np.inf
+        self._lowest = np.minimum(slowest, self._highest)
+        #: Whether the rates alone are free: a thick layer may leave them no room.
+        self.rate = bool((self._lowest < self._highest).any())
 
     def at(self, times: tuple[float, ...]) -> SearchSpace:
         """Return the coordinates of the same kind for surfaces that take over at these times, s."""
@@ -142,7 +145,7 @@ class SearchSpace:
     @property
     def _per_input(self) -> int:
         """Numbers of the reaching law that are free, for each input."""
-        return 2 if self.freedom.reaching else int(bool(self.freedom.rate))
+        return 2 if self.freedom.reaching else int(self.rate)
 
     def steps(self, rng: np.random.Generator, spread: FloatArray) -> FloatArray:
         """Draw steps in z, (N, d), of standard deviations ``spread``, (N,).
@@ -165,7 +168,7 @@ class SearchSpace:
                 eta, layer = (law or self.loop.reaching).per_surface(self.m)
                 part = np.clip((eta / layer - 1.0) / (self._fastest - 1.0), 1e-6, 1 - 1e-6)
                 parts += [np.log(eta), np.log(part / (1 - part))]
-            elif self.freedom.rate:
+            elif self.rate:
                 eta, layer = (law or self.loop.reaching).per_surface(self.m)
                 parts.append(np.log(np.clip(eta / layer, self._lowest, self._highest)))
         return np.concatenate(parts)
@@ -176,7 +179,7 @@ class SearchSpace:
         vectors = np.empty((len(z), self.segments, 2 * self.m * self.n))
         gains = np.empty((len(z), self.segments, 2 * self.m * self.freedom.reaching))
         _decode(rows, self._base, self._places, self._width, self._fastest, vectors, gains)
-        if self.freedom.rate:
+        if self.rate:
             low, high = np.log(self._lowest), np.log(self._highest)
             layer = self._eta / np.exp(np.clip(rows[:, :, self._entries :], low, high))
             gains = np.concatenate([np.broadcast_to(self._eta, layer.shape), layer], axis=2)
