@@ -128,12 +128,13 @@ def _regulates(cascade: Cascade) -> bool:
     if cascade.loop.price_of_time > 0:
         return False
     mechanism, stage = cascade.mechanism, cascade.objective.stage_function(cascade.mechanism)
-    rest = np.zeros(2 * mechanism.n + mechanism.m)
-    full = rest.copy()
-    full[2 * mechanism.n :] = finite_limits(mechanism)
-    least = ERROR_PRICE * float(stage(*full)[0]) / mechanism.m
-    errors = [float(stage(*one)[0]) for one in np.eye(len(rest))[: mechanism.n]]
-    return all(error >= least * (1 - 1e-9) for error in errors)
+    n, size = mechanism.n, 2 * mechanism.n + mechanism.m
+    full = np.r_[np.zeros(2 * n), finite_limits(mechanism)]
+    rest, effort, *errors = (
+        float(stage(*at)[0]) for at in (np.zeros(size), full, *np.eye(size)[:n])
+    )
+    least = ERROR_PRICE * (effort - rest) / mechanism.m
+    return all(error - rest >= least * (1 - 1e-9) for error in errors)
 
 
 def reaching_for(estimator: Estimator) -> ReachingLaw:
