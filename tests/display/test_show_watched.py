@@ -161,7 +161,7 @@ def test_a_log_that_is_removed_ends_the_show(book: Log) -> None:
 def test_simulated_time_is_not_watched() -> None:
     code, _, err = run("run", "rotary_pendulum", "--simulated", "--show")
     assert code == 2
-    assert "--show with --simulated" in err
+    assert "--show: got with --simulated" in err
     assert "undertow show run.db" in err
 
 
