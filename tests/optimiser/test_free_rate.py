@@ -71,7 +71,8 @@ def test_rates_go_with_no_free_reaching_law() -> None:
     """Which has its own."""
     with pytest.raises(InvalidInputError, match="reaching=True, rate=True"):
         DecisionVariables(reaching=True, rate=True)
-    assert DecisionVariables(rate=True).plainer == DecisionVariables(rate=False)
+    assert DecisionVariables(alpha_a=True, rate=True).plainer == DecisionVariables(rate=True)
+    assert DecisionVariables(rate=True).plainer is None
 
 
 @pytest.mark.parametrize(

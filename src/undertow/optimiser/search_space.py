@@ -84,14 +84,15 @@ class DecisionVariables:
 
     @property
     def plainer(self) -> DecisionVariables | None:
-        """A set that this one contains: one surface, then the given law, then plain α_a.
+        """A set that this one contains: one surface, then plain reaching, then plain α_a.
 
-        ``None`` for the paper's three parameters.
+        ``None`` for the paper's three parameters, with free rates too: these are found as surely
+        from the beginning.
         """
         if self.schedule or len(self.times) > 1:
             return replace(self, schedule=0.0, times=(0.0,))
-        if self.reaching or self.rate:
-            return replace(self, reaching=False, rate=False)
+        if self.reaching:
+            return replace(self, reaching=False)
         return replace(self, alpha_a=False) if self.alpha_a else None
 
 
