@@ -53,7 +53,7 @@ class Settings:
     max_travel
         Largest |q_i|, rad or m, besides the ranges of the coordinates: where a run is stopped.
         Plans keep within 95 % of it, as of the ranges; free angles beyond ``fall_angle`` have
-        fallen before.  A bound makes searches some four times as long.
+        fallen before.  A bound makes first searches four to ten times as long.
     fall_angle
         A free angle further than this from the target has fallen, rad; with a swing-up one further
         than 60° in any case.
