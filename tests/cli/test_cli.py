@@ -826,16 +826,32 @@ def test_progress_says_how_much_time_is_left(
     assert capsys.readouterr().err.splitlines() == ["… a", "… b, 30 s left", "… c"]
 
 
-def test_what_comes_before_any_of_it_is_done_is_no_pace(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A first search of a minute made ten seconds of motion look like ten minutes."""
-    clock = iter((100.0, 160.0, 170.0))
+@pytest.mark.parametrize(
+    ("times", "told", "lines"),
+    [
+        pytest.param(
+            (100.0, 160.0, 170.0), (("search", 0.0), ("b", 0.0), ("c", 0.5)),
+            ["… search", "… b", "… c, 10 s left"],
+            id="a first search of a minute made ten seconds of motion look like ten minutes",
+        ),
+        pytest.param(
+            (100.0, 105.0, 150.0), (("a", 0.0), ("b", 0.01), ("c", 0.5)),
+            ["… a", "… b", "… c, 50 s left"],
+            id="five seconds of compiling for the first hundredth are no pace",
+        ),
+    ],
+)  # fmt: skip
+def test_time_left_is_told_by_what_is_done_of_it(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+    times: tuple[float, ...], told: tuple[tuple[str, float], ...], lines: list[str],
+) -> None:  # fmt: skip
+    """What comes before any of it is done is no pace, nor is what little is done at first."""
+    clock = iter(times)
     monkeypatch.setattr("undertow.cli.terminal.time.monotonic", lambda: next(clock))
     with progress_bar() as tell:
-        for what, part in (("search", 0.0), ("b", 0.0), ("c", 0.5)):
+        for what, part in told:
             tell(what, part)
-    assert capsys.readouterr().err.splitlines() == ["… search", "… b", "… c, 10 s left"]
+    assert capsys.readouterr().err.splitlines() == lines
 
 
 def test_a_cascade_says_that_it_searches_before_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -849,18 +865,6 @@ def test_a_cascade_says_that_it_searches_before_it_does(monkeypatch: pytest.Monk
     monkeypatch.setattr("undertow.cli.control.Cascade.simulate", searching)
     _, _, err = run("simulate", RIG)
     assert err.splitlines()[:2] == ["… searching for the first plan", "… cascade"]
-
-
-def test_what_little_is_done_does_not_say_how_much_time_is_left(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Five seconds of compiling for the first hundredth are no pace."""
-    clock = iter((100.0, 105.0, 150.0))
-    monkeypatch.setattr("undertow.cli.terminal.time.monotonic", lambda: next(clock))
-    with progress_bar() as tell:
-        for what, part in (("a", 0.0), ("b", 0.01), ("c", 0.5)):
-            tell(what, part)
-    assert capsys.readouterr().err.splitlines() == ["… a", "… b", "… c, 50 s left"]
 
 
 def test_a_table_wider_than_the_terminal_is_not_cut(
