@@ -199,11 +199,9 @@ class Planning:
         loops = [whole]
         if belief is not None and estimate is not None:
             loops.insert(0, whole.believing(whole.mechanism, belief.alone(estimate)))
-        free = planners.optimiser.freedom
-        gently = (
-            free.reaching or planners.optimiser.space.rate
-        ) and not planners.optimiser.counts_time
-        if planners.recourse and (free.schedule or gently):
+        optimiser = planners.optimiser
+        gently = optimiser.space.frees_law and not optimiser.counts_time
+        if planners.recourse and (optimiser.freedom.schedule or gently):
             loops.insert(0, predictions.estimated(estimate))
 
         def smaller(loop: ClosedLoop) -> ClosedLoop:

@@ -168,7 +168,7 @@ class Optimiser:
         feedback, at rates near those at which it slides.
         """
         plans = [Plan.of(design) for design in self.designs]
-        if (self.freedom.reaching or self.space.rate) and not self.counts_time:
+        if self.space.frees_law and not self.counts_time:
             m, switching = self.loop.mechanism.m, self.loop.reaching.switching
             for design in self.designs:
                 slides = float(stability_margin(self.loop.mechanism, design))

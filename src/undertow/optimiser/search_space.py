@@ -144,6 +144,11 @@ class SearchSpace:
         return self.segments * (self._entries + self.m * self._per_input)
 
     @property
+    def frees_law(self) -> bool:
+        """Whether anything of the reaching law is free, so that each plan has its own."""
+        return self._per_input > 0
+
+    @property
     def _per_input(self) -> int:
         """Numbers of the reaching law that are free, for each input."""
         return 2 if self.freedom.reaching else int(self.rate)
@@ -184,7 +189,7 @@ class SearchSpace:
             low, high = np.log(self._lowest), np.log(self._highest)
             layer = self._eta / np.exp(np.clip(rows[:, :, self._entries :], low, high))
             gains = np.concatenate([np.broadcast_to(self._eta, layer.shape), layer], axis=2)
-        return vectors, gains if self._per_input else None
+        return vectors, gains if self.frees_law else None
 
     def plan(self, z: FloatArray) -> Plan:
         """Return the plan at some coordinates, (d,)."""

@@ -301,7 +301,7 @@ class Optimisation:
         """Return the coordinates of the incumbent; where they cannot express it, score it."""
         here = self.space.encode(incumbent)
         loop, freedom = self.loop, self.space.freedom
-        plain = freedom.reaching or self.space.rate or incumbent.reaching is None
+        plain = self.space.frees_law or incumbent.reaching is None
         if plain and incumbent.times == freedom.times:
             self._unscored = incumbent
             return here
