@@ -15,6 +15,6 @@ figure = run.plot()
 # %%
 # The same start, with the first surface kept to the end:
 
-fixed = cascade.loop.simulate(pendulum.state(phi=ut.deg(40)), run.surfaces[0])
+fixed = cascade.loop.simulate(pendulum.state(phi=ut.deg(40)), run.plans[0])
 kept = fixed.plot("the first surface, kept")
 print(f"re-optimised {run.time:.2f} s, kept {fixed.time:.2f} s")

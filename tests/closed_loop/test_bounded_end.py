@@ -65,10 +65,20 @@ def test_the_reach_of_a_step_bounds_what_scipy_integrates() -> None:
                 assert reach[level, 0, 0, lane] <= 1.1 * exact[0, 0]
 
 
+def _agree(loop: ClosedLoop, seen: FloatArray, exact: FloatArray) -> None:
+    """Smallest margins up to the spare part of a bound are the same, and no margin is smaller."""
+    spare = np.array([spare for _, spare in loop.objective.boxes(loop.mechanism)])
+    np.testing.assert_array_equal(np.minimum(seen, spare), np.minimum(exact, spare))
+    assert (seen >= exact - TAIL_RTOL * np.abs(exact)).all()
+
+
 @pytest.mark.slow  # kernels of their own
 @pytest.mark.parametrize("goal", [ut.MinimumEnergy(), ut.MinimumTime()])
 def test_a_loop_with_travel_ends_in_large_steps(goal: ut.Objective) -> None:
-    """Verdicts and margins are those of small steps, costs agree to 0.1 %; far fewer steps."""
+    """Verdicts are those of small steps, costs agree to 0.1 %; far fewer steps.
+
+    Margins within which a bound may be met are the same, wider ones are seen at fewer instants.
+    """
     rig = ut.mechanisms.cart_pendulum()
     rng = np.random.default_rng(11)
     states = rng.uniform([-1.42, -0.3, -0.5, -0.5], [1.42, 0.3, 0.5, 0.5], (400, 4))
@@ -78,7 +88,7 @@ def test_a_loop_with_travel_ends_in_large_steps(goal: ut.Objective) -> None:
     small = exact.batch(states, surfaces, stable_only=True)
     large = replace(exact, tail_rtol=TAIL_RTOL).batch(states, surfaces, stable_only=True)
     np.testing.assert_array_equal(large.event, small.event)
-    np.testing.assert_array_equal(large.path, small.path)
+    _agree(exact, large.path, small.path)
     assert (small.event == Event.CONSTRAINT).sum() > 20
     both = small.reached
     assert both.sum() > 60
@@ -140,7 +150,7 @@ def test_a_late_touch_is_seen_and_a_near_miss_is_none(name: str) -> None:
         small = exact.batch(ray * scale[:, None], surfaces)
         large = ended.batch(ray * scale[:, None], surfaces)
         np.testing.assert_array_equal(large.event, small.event)
-        np.testing.assert_array_equal(large.path, small.path)
+        _agree(exact, large.path, small.path)
         both = small.reached
         np.testing.assert_allclose(large.cost[both], small.cost[both], rtol=1e-3)
         shorter += int((large.steps < 0.9 * small.steps).sum())

@@ -91,7 +91,9 @@ class Cascade:
         (0: continuous), as for :class:`undertow.ClosedLoop`.
     freedom
         What may be chosen besides the paper's surface parameters: reaching gains, a
-        schedule of surfaces.  Times of a schedule are multiples of the period.  With reaching gains
+        schedule of surfaces.  Times of a schedule are multiples of the period.  By default the
+        rates at which surfaces are reached, too, where the cost weighs errors as ``effort`` does,
+        or more, see :meth:`undertow.DecisionVariables.for_loop`.  With reaching gains
         a smooth cost comes near the bound of each plant, by laws so gentle that friction which
         nobody estimates may keep them from arriving.
     cold, warm
@@ -295,7 +297,7 @@ class Cascade:
         loop = self.predictions.estimated(None) if single else self.loop
         return Optimiser(
             searched(loop, self.freedom),
-            self.first, self.cold, self.warm, self.freedom, seed=self.seed,
+            self.first, self.cold, self.warm, self.freedom.for_loop(loop), seed=self.seed,
         )  # fmt: skip
 
     @cached_property

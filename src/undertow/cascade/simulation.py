@@ -180,8 +180,16 @@ class Run:
 
     @property
     def surfaces(self) -> tuple[Surface, ...]:
-        """The surface in use after each decision."""
+        """The surface in use after each decision; how it is reached is in :attr:`plans`."""
         return tuple(update.surface for update in self.updates)
+
+    @property
+    def plans(self) -> tuple[Plan, ...]:
+        """The plan in use after each decision: surfaces, and where it says so how they are reached.
+
+        Simulate it alone by ``cascade.loop.simulate(x0, run.plans[0])``, or export it to C.
+        """
+        return tuple(update.plan for update in self.updates)
 
     @property
     def verdicts(self) -> tuple[Verdict | None, ...]:

@@ -19,9 +19,9 @@ that is bounded moves by no more than
     Σ_j F̄_ij |ẋ_j|,   F̄_ij ≥ |F_ij(s)| for all 0 ≤ s ≤ h;
 
 where r grows to r(a) the motion differs by less than F̄ |r(a) − r(x)|, and twice that is added.  A
-step is taken only if the margin that is then left is still larger than a spare part of the bound,
-and than the smallest margin of the small steps: no large step decides whether a bound is kept, and
-none changes the smallest margin.  A lane that no step is short enough for goes back to small ones.
+step is taken only if the margin that is then left is still larger than a spare part of the bound:
+no large step decides whether it is kept, and of the smallest margin what is less than the spare
+part is that of small steps.  A lane that no step is short enough for goes back to small ones.
 """
 
 from __future__ import annotations
@@ -34,6 +34,9 @@ from undertow.closed_loop.work_array import ENTERED, LANES, WorkArray, code, ent
 
 #: Codes of a lane that waits for its large steps, and of one that cannot be done in this way.
 HANDED_OVER, GIVEN_BACK = -1.0, -2.0
+
+#: Column of the results that has the smallest margin of the first path constraint.
+LOWEST = 6
 
 #: Steps that a lane may take.
 MOST = 4000
@@ -78,7 +81,7 @@ def begin(r: WorkArray) -> list[str]:
         *(f"x_{j} = out[b + i, out.shape[1] - {1 + size - j}]" for j in range(size)),
         *(f"{row} = x_{j}" for j, row in enumerate(r.x)),
         *(f"{row} = x_{j}" for j, row in enumerate(r.stage_x)),
-        *(f"{row} = out[b + i, {6 + k}]" for k, row in enumerate(r.low)),
+        *(f"{row} = out[b + i, {LOWEST + k}]" for k, row in enumerate(r.low)),
         *_level(r, [f"x_{j}" for j in range(size)]),
         f"cost, begins = {r.cost}, {r.code} == {HANDED_OVER}",
         f"{r.active} = 1.0 if begins else 0.0",
@@ -142,9 +145,9 @@ def _clear(r: WorkArray) -> list[str]:
     lines += [
         f"rate_{j + len(half)} = abs({row}) + 2.0 * abs(y_{j})" for j, row in enumerate(r.pull)
     ]
-    for k, (row, (_, spare)) in enumerate(zip(r.low, r.boxes, strict=True)):
+    for k, (_, spare) in enumerate(r.boxes):
         moved = total(f"{e} * rate_{j}" for j, e in enumerate(r.reach[k]))
-        lines += [f"moved_{k} = {moved}", f"left_{k} = {r.room[k]} - max({spare!r}, {row})"]
+        lines += [f"moved_{k} = {moved}", f"left_{k} = {r.room[k]} - {spare!r}"]
     boxes = range(len(r.boxes))
     return [
         *lines,
@@ -185,6 +188,7 @@ def second_half(r: WorkArray) -> list[str]:
     """From the rates at a to the end of the step, where it is taken; and the next step."""
     size, half = len(r.x), range(len(r.linear))
     bounds, clear, wide = (_clear(r), " & clear", " & wide") if r.boxes else ([], "", "")
+    boxes = list(zip(r.room, r.low, strict=True))
     return [
         *(f"x_{j} = {row}" for j, row in enumerate(r.x)),
         *(f"a_{j} = {row}" for j, row in enumerate(r.stage_x)),
@@ -214,6 +218,7 @@ def second_half(r: WorkArray) -> list[str]:
         *ENTERED,
         "inside = (outer <= terminal) | passed",
         "part = part if inside else 1.0",
+        *(f"room_{k}, low_{k} = {room}, {low}" for k, (room, low) in enumerate(boxes)),
         "far = before - terminal > span * speed",
         f"taken = going & sound & ((size <= 0.0) | ((level <= small) & far & (not inside){clear}))",
         *(f"x_{j} = x_{j} + part * m_{j} if taken else x_{j}" for j in range(size)),
@@ -231,6 +236,10 @@ def second_half(r: WorkArray) -> list[str]:
         f"{r.last} = bend if taken else last",
         f"{r.ago} = span if taken else ago",
         f"{r.steps} = {r.steps} + (1.0 if going else 0.0)",
+        *(
+            f"{low} = room_{k} if taken & (room_{k} < low_{k}) else low_{k}"
+            for k, (_, low) in enumerate(boxes)
+        ),
         f"{r.cost} = cost",
         f"{r.end} = end",
         f"{r.radius} = radius",
@@ -254,5 +263,6 @@ def finish(r: WorkArray) -> list[str]:
         "out[b + i, 0] = cost - counted * level if begun else cost",
         f"out[b + i, 2] = {GIVEN_BACK} if {r.active} > 0.0 else {r.code}",
         *(f"out[b + i, {column}] = {row}" for row, column in columns.items()),
+        *(f"out[b + i, {LOWEST + k}] = {row}" for k, row in enumerate(r.low)),
         *(f"out[b + i, out.shape[1] - {1 + size - j}] = x_{j}" for j in range(size)),
     ]

@@ -287,8 +287,8 @@ class _Writer:
                 for row, limit in zip(r.u, self.limits, strict=True)
             ),
             *(
-                f"calm = calm & ({row} > max({spare!r}, {low}))"
-                for row, low, (_, spare) in zip(r.path, r.low, boxes, strict=bool(boxes))
+                f"calm = calm & ({row} > {spare!r})"
+                for row, (_, spare) in zip(r.path, boxes, strict=bool(boxes))
             ),
             f"code, active, end = {r.code}, {r.active}, {r.end}",
             f"{r.end} = {self.time} if calm else end",

@@ -51,7 +51,8 @@ class Batch:
     ``cost`` is ∫Φ dt until the end; ``time`` the end, s; ``event`` an :class:`Event`;
     ``radius`` the final ‖x‖₂; ``singular`` the smallest det Γ(q)/det Γ(0) met;
     ``input`` the smallest u_max − |demand| (only with a hard input limit);
-    ``path`` (N, w) the smallest margins of the path constraints; ``x`` (N, 2n) final states.
+    ``path`` (N, w) the smallest margins of the path constraints at the instants of its steps; ``x``
+    (N, 2n) final states.
     ``closest``, ``closest_time`` and ``closest_x`` (N, 2n): the smallest ‖x‖₂ met, when and
     where, if it was asked for.  ``steps``: how many it took, small ones (four evaluations of
     law and plant) and large ones (two) alike.

@@ -182,7 +182,7 @@ def motion_margins(
         margins = list(surface_margins(loop.mechanism, plan.surfaces[-1]))
     except SingularSurfaceError as error:
         return (), str(error), error.remedy
-    batch = loop.batch(x, plan, duration=horizon)
+    batch = loop.with_steps(loop.step, 0.0).batch(x, plan, duration=horizon)
     what, least = "(37) along the motion: min det Γ(q)/det Γ(0)", float(batch.singular[0])
     margins.append(Margin(what, least, "", "Start closer to the target"))
     if objective.hard_input:

@@ -20,6 +20,7 @@ from undertow.closed_loop import ClosedLoop, RolloutBuffers
 from undertow.closed_loop.trajectory import Batch
 from undertow.law import LawLayout, Plan, ReachingLaw, Surface, rising_from_zero
 from undertow.models import FloatArray, growth_rate
+from undertow.objective import ERROR_PRICE, finite_limits
 from undertow.symbolic import compiled
 
 #: Slowest rate η/ε at which a surface is reached, 1/s, where the rate alone is free; and how many
@@ -43,7 +44,8 @@ class DecisionVariables:
     rate
         Of the reaching law the rates η_i/ε_i alone, at most those of the given law, whose gains η_i
         stay: near the target it may be gentler then, and far from it is as strong as ever.
-        ``None``: where :func:`undertow.runtime.for_rig` finds that it pays.
+        ``None``: a cascade frees them where that pays, see :meth:`for_loop`; an optimiser by itself
+        does not.
     schedule
         Surfaces one after another, with their reaching laws.  For least time each for so long, s,
         and as many as the motion needs; for another cost five, the first for so long or longer,
@@ -94,6 +96,29 @@ class DecisionVariables:
         if self.reaching:
             return replace(self, reaching=False)
         return replace(self, alpha_a=False) if self.alpha_a else None
+
+    def for_loop(self, loop: ClosedLoop) -> DecisionVariables:
+        """Return these as they suit a closed loop: rates that were left open are free, or not.
+
+        They are where the reaching law is not, the cost is smooth, and an error of each coordinate
+        costs at least what it does in ``effort`` beside the full input: what is best near the
+        target is a linear-quadratic regulator then, which brings every coordinate home.  Where
+        errors cost less it is so gentle that dry friction takes more than is saved.
+        """
+        if self.rate is not None or self.reaching:
+            return self
+        return replace(self, rate=not loop.price_of_time > 0 and _regulates(loop))
+
+
+def _regulates(loop: ClosedLoop) -> bool:
+    mechanism, stage = loop.mechanism, loop.objective.stage_function(loop.mechanism)
+    n, size = mechanism.n, 2 * mechanism.n + mechanism.m
+    full = np.r_[np.zeros(2 * n), finite_limits(mechanism)]
+    rest, effort, *errors = (
+        float(stage(*at)[0]) for at in (np.zeros(size), full, *np.eye(size)[:n])
+    )
+    least = ERROR_PRICE * (effort - rest) / mechanism.m
+    return all(error - rest >= least * (1 - 1e-9) for error in errors)
 
 
 class SearchSpace:

@@ -16,7 +16,7 @@ from undertow.cascade.robustness import delay_margin
 from undertow.estimators import Belief, Estimator, KalmanFilter
 from undertow.law import SUITED, ReachingLaw, first_surface, usual_reaching
 from undertow.models import Mechanism, full_accelerations
-from undertow.objective import ERROR_PRICE, finite_limits
+from undertow.objective import finite_limits
 from undertow.plants import Bench, Encoder
 
 #: What every admitted surface must bear: periods of delay, of no more than ``SAMPLE``, s, each, and
@@ -102,39 +102,16 @@ def for_rig(cascade: Cascade, estimator: Estimator) -> Cascade:
     """Return a cascade that suits a rig, where it is as it stands for exact states.
 
     The gate becomes :func:`default_gate`, the reaching law :func:`reaching_for`, the covariance
-    that of the estimator's noise; the rate at which surfaces are reached is free where the cost
-    weighs errors as ``effort`` does, or more.  What was chosen stays.
+    that of the estimator's noise.  What was chosen stays.
     """
     gate, reaching, covariance = cascade.gate, cascade.reaching, cascade.covariance
-    freedom = cascade.freedom
     if gate is cost_gate:
         gate = default_gate(estimator)
     if reaching in (ReachingLaw(), replace(cascade, reaching=SUITED).reaching):
         reaching = reaching_for(estimator)
     if covariance is None:
         covariance = estimator.noise_covariance()
-    if freedom.rate is None and not freedom.reaching and cascade.planner is None:
-        freedom = replace(freedom, rate=_regulates(cascade))
-    return replace(cascade, gate=gate, reaching=reaching, covariance=covariance, freedom=freedom)
-
-
-def _regulates(cascade: Cascade) -> bool:
-    """Whether the cost is smooth, and an error costs at least what it does in ``effort``.
-
-    So much beside the full input: what is best near the target is a linear-quadratic regulator
-    then, which brings every coordinate home.  Where errors cost less it is so gentle that dry
-    friction takes more than is saved.
-    """
-    if cascade.loop.price_of_time > 0:
-        return False
-    mechanism, stage = cascade.mechanism, cascade.objective.stage_function(cascade.mechanism)
-    n, size = mechanism.n, 2 * mechanism.n + mechanism.m
-    full = np.r_[np.zeros(2 * n), finite_limits(mechanism)]
-    rest, effort, *errors = (
-        float(stage(*at)[0]) for at in (np.zeros(size), full, *np.eye(size)[:n])
-    )
-    least = ERROR_PRICE * (effort - rest) / mechanism.m
-    return all(error - rest >= least * (1 - 1e-9) for error in errors)
+    return replace(cascade, gate=gate, reaching=reaching, covariance=covariance)
 
 
 def reaching_for(estimator: Estimator) -> ReachingLaw:

@@ -40,6 +40,16 @@ def _surface_words(surface: Surface) -> str:
     return repr(surface).removeprefix("Surface(").removesuffix(")")
 
 
+def _plan_words(plan: Plan) -> str:
+    """The surface that a plan begins with, and how it is reached where the plan says that."""
+    surface, law = plan.at(0.0)
+    if law is None:
+        return _surface_words(surface)
+    eta, layer = law.per_surface(surface.m)
+    rates = ", ".join(f"{rate:.3g}" for rate in eta / layer)
+    return f"{_surface_words(surface)}; reached at η/ε = {rates} 1/s"
+
+
 def _head(
     mechanism: Mechanism,
     objective: Objective,
@@ -110,8 +120,8 @@ def motion_report(
     else:
         admitted = sum(update.admission.accepted for update in run.updates)
         rows += [
-            ("first optimum", _surface_words(surface)),
-            ("last surface", _surface_words(run.surfaces[-1])),
+            ("first optimum", _plan_words(run.updates[0].plan)),
+            ("last surface", _plan_words(run.updates[-1].plan)),
             ("optimisations", f"{len(run.updates)}, {admitted} admitted"),
         ]
         if any(verdict is not None for verdict in run.verdicts):
