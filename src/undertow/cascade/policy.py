@@ -7,6 +7,7 @@ goes in and out as ``state``, one entry for each episode, as that of a recurrent
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, Protocol
 
@@ -15,9 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from undertow.base import InvalidInputError, checked, positive
 from undertow.cascade.cascade import Cascade
+from undertow.cascade.robustness import DelayGate
 from undertow.cascade.simulation import LEARNING, is_news
 from undertow.cascade.state import CascadeState
 from undertow.closed_loop import ClosedLoop
+from undertow.closed_loop.gate import cost_gate
 from undertow.estimators import ParameterEstimate
 from undertow.law import InnerLoop, Plan, Surface
 from undertow.models import FloatArray, Mechanism
@@ -203,7 +206,9 @@ def policy(
     Parameters
     ----------
     controller
-        A cascade; or a closed loop, whose law keeps to ``surfaces``.
+        A cascade, which from the second surface on admits what bears a period of delay while inputs
+        are held, unless it has a gate of its own; or a closed loop, whose law keeps to
+        ``surfaces``.
     surfaces
         What a loop slides on.
     period
@@ -255,6 +260,8 @@ def policy(
                 limit=f"a whole part of the cascade's, {cascade.period:g} s",
                 remedy="Change one of them",
             )
+        if cascade.gate is cost_gate:  # what it predicts is not held
+            cascade = replace(cascade, gate=DelayGate(period, period))
         return Policy(mechanism, partial(_CascadeEpisode, cascade, period), period)
     assert isinstance(controller, ClosedLoop)  # no cascade
     assert plan is not None  # no cascade
