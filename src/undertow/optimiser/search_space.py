@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from undertow.base import InvalidInputError, check_fields, positive, require
+from undertow.base import InvalidInputError, check_fields, checked, positive, require
 from undertow.closed_loop import ClosedLoop, RolloutBuffers
 from undertow.closed_loop.trajectory import Batch
 from undertow.law import LawLayout, Plan, ReachingLaw, Surface, rising_from_zero
@@ -97,6 +97,7 @@ class DecisionVariables:
             return replace(self, reaching=False)
         return replace(self, alpha_a=False) if self.alpha_a else None
 
+    @checked
     def for_loop(self, loop: ClosedLoop) -> DecisionVariables:
         """Return these as they suit a closed loop: rates that were left open are free, or not.
 
