@@ -2,8 +2,8 @@
 
 Every mechanism of the library from its usual start, with the rate of the given reaching law and
 with one that is searched with the surface (``DecisionVariables(rate=...)``), over the bound of
-optimal control; and on random plants within the tolerances that the cascade assumes, where it learns: the
-cost with a free rate over that with the given one.
+optimal control; and on random plants within the tolerances that the cascade assumes, where it
+learns: the cost with a free rate over that with the given one.
 
     python benchmarks/rates.py [--names NAME ...] [--plants 12]
 """
