@@ -1219,6 +1219,10 @@ def test_bad_requests_are_refused_with_value_and_limit() -> None:
         (lambda: EmbeddedController(rig, s, slew=-1.0), "slew rate"),
         (lambda: EmbeddedController(rig, s, prefix="2x"), "a C name"),
         (lambda: EmbeddedController(rig, s, missed=-1), "0 to 32766"),
+        (lambda: EmbeddedController(rig, s, missed=1.5), "a whole number"),  # type: ignore[arg-type]
+        (lambda: ut.export_c(rig, s, "never", perid=0.002), "Did you mean period?"),
+        (lambda: ut.export_c(rig, s, "never", period="1 ms"), "must be a number"),
+        (lambda: ut.export_c(rig, s, "never", differentiator="kalman"), "KalmanStep()"),
         (lambda: EmbeddedController(rig, s, missed=2**15 - 1), "0 to 32766"),
         (lambda: EmbeddedController(rig, three_rows(rig), rows=2), "3 (those of the plan)"),
         (lambda: EmbeddedController(rig, Plan((s, s), (0.0, 1e-4))), "apart"),

@@ -17,7 +17,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import InvalidInputError, one_for_each, one_of, positive, require
+from undertow.base import InvalidInputError, check_fields, one_for_each, one_of, positive, require
 from undertow.export.estimate import DerivativeStep, EstimatorStep, KalmanStep
 from undertow.export.names import HEADERS, c_name
 from undertow.law import (
@@ -122,6 +122,15 @@ class EmbeddedController:
 
     def __post_init__(self) -> None:
         """Refuse what cannot run: see the class."""
+        check_fields(
+            self, "mechanism", "surface", "period", "slew", "missed", "rows", "real", "prefix"
+        )
+        require(
+            hasattr(self.differentiator, "gains"),
+            "differentiator",
+            repr(self.differentiator),
+            "undertow.export.DerivativeStep(), SuperTwistingStep() or KalmanStep()",
+        )
         limits = self.mechanism.input_limits
         built_in = len(self.plan.surfaces)
         named = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,15}", self.prefix)

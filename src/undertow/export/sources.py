@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 import re
 import textwrap
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import sympy as sp
 
-from undertow.base import checked, versions, write_files
+from undertow.base import checked, one_of, versions, write_files
 from undertow.export.controller import FACTOR, WIDTH, EmbeddedController, plan_text
 from undertow.export.estimate import estimate_code
 from undertow.export.names import LARGEST, ascii_words, at_most, c_name, macros, prefixed, template
@@ -86,6 +87,9 @@ def export_c(
     SingularSurfaceError, UnstableSurfaceError
         When the law does not exist at the target, or the motion does not die out there.
     """
+    known = [field.name for field in fields(EmbeddedController)][2:]
+    for name in settings:
+        one_of("setting of export_c", name, known)
     write_files(Path(folder), files(EmbeddedController(mechanism, surface, **settings)))
     return Path(folder)
 
