@@ -171,10 +171,11 @@ def _unwound(mechanism: Mechanism, found: dict[str, float], guess: FloatArray) -
 
 
 def _nearest_first(mechanism: Mechanism) -> Iterator[FloatArray]:
-    """Zero where it is an equilibrium, then those that are found, which takes longer."""
-    rests = _rests(mechanism)
+    """Zero where it is one of those that are looked for, then the others, which takes longer."""
+    zero = np.zeros(mechanism.n)
+    rests = _rests(mechanism) and not _obstacle(mechanism, zero)[0]
     if rests:
-        yield np.zeros(mechanism.n)
+        yield zero
     yield from (e.q for e in _equilibria(mechanism) if np.any(e.q) or not rests)
 
 
