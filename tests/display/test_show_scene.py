@@ -138,6 +138,15 @@ def test_a_file_is_drawn_at_its_target_with_what_is_frozen(tmp_path: Path) -> No
     np.testing.assert_allclose(tip, [0.0, -0.6], atol=1e-9)
 
 
+def test_a_mechanism_of_the_library_about_another_target_is_not_drawn_upright() -> None:
+    """Its figure is that of the library's target; its description says where it is now."""
+    rig = ut.mechanisms.rotary_pendulum(d_e=0.025).with_disturbance_bounds(0.1, 0.0)
+    assert not any(isinstance(part, Label) for part in sketch(rig).parts)
+    hanging = ut.modelling.move_target(rig, phi=np.pi)
+    assert any(isinstance(part, Label) for part in sketch(hanging).parts)
+    assert hanging.description.endswith("target theta = 0°, phi = 180° of the old one")
+
+
 def test_what_has_no_kinematics_gets_labelled_dials() -> None:
     """Equations alone say nothing of places: a dial or rail a coordinate, each with its name."""
     a, b = ut.Coordinate("a"), ut.Coordinate("b", "m")

@@ -485,15 +485,15 @@ def move_target(mechanism: Mechanism, /, **equilibrium: float) -> Mechanism:
     Returns
     -------
     Mechanism
-        Its coordinates keep their names and read zero at the new target.  The start state is
-        dropped: it belonged to the old one.
+        Its coordinates keep their names and read zero at the new target, which its description
+        says.  The start state is dropped: it belonged to the old one.
 
     Raises
     ------
     ModelError
         When it is no equilibrium of the free coordinates, f_u ≠ 0.
     """
-    _positions(mechanism, equilibrium)
+    place = f"target {_position(mechanism, _positions(mechanism, equilibrium))} of the old one"
     coordinates, (mass, force, potential) = shifted(
         mechanism.name,
         mechanism.coordinates,
@@ -509,6 +509,7 @@ def move_target(mechanism: Mechanism, /, **equilibrium: float) -> Mechanism:
         force=force,
         potential=potential,
         start={},
+        description="\n".join(filter(None, (mechanism.description, place))),
     )
     check_balanced(moved)
     return moved
