@@ -199,6 +199,19 @@ def test_each_rollout_may_have_its_own_reaching_law(
         np.testing.assert_array_equal(together.x[i], alone.x[0])
 
 
+@pytest.mark.parametrize("zoh_steps", [0, 1])
+def test_a_motion_of_no_length_has_two_rows_like_any_other(
+    rig: ut.Mechanism, quick: ut.Surface, zoh_steps: int
+) -> None:
+    """A length below the rounding of a step gave one time to two states: no plot, no table."""
+    loop = ut.ClosedLoop(rig, zoh_steps=zoh_steps)
+    for length in (0.0, 1e-9):
+        run = loop.simulate(rig.state(phi=0.1), quick, duration=length)
+        assert len(run.t) == len(run.x) == 2
+        assert len(run.columns["phi"][0]) == 2
+        run.plot()
+
+
 def test_a_schedule_equals_its_pieces(
     loop: ut.ClosedLoop, starts: FloatArray, surfaces: list[ut.Surface]
 ) -> None:

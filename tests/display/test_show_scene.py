@@ -32,6 +32,12 @@ MJCF = """<mujoco><worldbody><body name="cart"><joint name="x" type="slide" axis
 axis="0 1 0"/><geom type="sphere" size="0.1" pos="0 0 0.5" mass="1"/></body></body></worldbody>
 <actuator><motor joint="x" ctrllimited="true" ctrlrange="-9 9"/></actuator></mujoco>"""
 
+FROZEN = """<mujoco><worldbody><body name="cart"><joint name="cart" type="slide" axis="1 0 0"/>
+<geom type="sphere" size="0.1" mass="1"/><body name="pole"><joint name="phi" type="hinge"
+axis="0 1 0"/><geom type="sphere" size="0.1" pos="0 0 0.3" mass="1"/><body name="wheel"
+pos="0 0 0.6"><joint name="wheel" axis="0 1 0"/><geom type="cylinder" size="0.1 0.01" mass="0.2"/>
+</body></body></body></worldbody></mujoco>"""
+
 
 @pytest.mark.parametrize("name", LIBRARY)
 def test_every_mechanism_is_drawn_and_slopes_are_derivatives(name: str) -> None:
@@ -110,6 +116,35 @@ def test_a_file_of_bodies_gets_a_stick_figure(tmp_path: Path, suffix: str, text:
         assert float(mechanism.energy(x)) - float(mechanism.energy(0 * x)) == pytest.approx(
             energy - (9.81 * (0.125 + 0.4 * 0.8) if suffix == "urdf" else 9.81 * 0.5), abs=1e-9
         )
+
+
+def test_a_file_is_drawn_at_its_target_with_what_is_frozen(tmp_path: Path) -> None:
+    """Every target of a file was drawn as the file is, upright; a frozen joint left dials."""
+    file = tmp_path / "own.urdf"
+    file.write_text(URDF)
+    for target, height in (("upright", 1.1), ("hanging", -1.1), ("elbow=180deg", -0.1)):
+        name = f"{file}:shoulder@{target}"
+        mechanism = named(name)
+        scene = Scene(mechanism, sketch_named(name, mechanism))
+        tip = scene.points(np.zeros(2), mechanism.parameter_values)[-1]
+        np.testing.assert_allclose(tip, [0.0, height], atol=1e-9)
+    frozen = tmp_path / "own.xml"
+    frozen.write_text(FROZEN)
+    name = f"{frozen}:cart,-wheel@hanging"
+    mechanism = named(name)
+    figure = sketch_named(name, mechanism)
+    assert not any(isinstance(part, Label) for part in figure.parts)
+    tip = Scene(mechanism, figure).points(np.zeros(2), mechanism.parameter_values)[-1]
+    np.testing.assert_allclose(tip, [0.0, -0.6], atol=1e-9)
+
+
+def test_a_mechanism_of_the_library_about_another_target_is_not_drawn_upright() -> None:
+    """Its figure is that of the library's target; its description says where it is now."""
+    rig = ut.mechanisms.rotary_pendulum(d_e=0.025).with_disturbance_bounds(0.1, 0.0)
+    assert not any(isinstance(part, Label) for part in sketch(rig).parts)
+    hanging = ut.modelling.move_target(rig, phi=np.pi)
+    assert any(isinstance(part, Label) for part in sketch(hanging).parts)
+    assert hanging.description.endswith("target theta = 0°, phi = 180° of the old one")
 
 
 def test_what_has_no_kinematics_gets_labelled_dials() -> None:

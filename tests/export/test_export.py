@@ -1218,7 +1218,12 @@ def test_bad_requests_are_refused_with_value_and_limit() -> None:
         (lambda: EmbeddedController(rig, s, period=math.nan), "> 0, < 1 s"),
         (lambda: EmbeddedController(rig, s, slew=-1.0), "slew rate"),
         (lambda: EmbeddedController(rig, s, prefix="2x"), "a C name"),
-        (lambda: EmbeddedController(rig, s, missed=-1), "0 or more"),
+        (lambda: EmbeddedController(rig, s, missed=-1), "0 to 32766"),
+        (lambda: EmbeddedController(rig, s, missed=1.5), "a whole number"),  # type: ignore[arg-type]
+        (lambda: ut.export_c(rig, s, "never", perid=0.002), "Did you mean period?"),
+        (lambda: ut.export_c(rig, s, "never", period="1 ms"), "must be a number"),
+        (lambda: ut.export_c(rig, s, "never", differentiator="kalman"), "KalmanStep()"),
+        (lambda: EmbeddedController(rig, s, missed=2**15 - 1), "0 to 32766"),
         (lambda: EmbeddedController(rig, three_rows(rig), rows=2), "3 (those of the plan)"),
         (lambda: EmbeddedController(rig, Plan((s, s), (0.0, 1e-4))), "apart"),
         (lambda: EmbeddedController(rig, s, differentiator=DerivativeStep(0.0)), "> 0"),
@@ -1329,9 +1334,35 @@ def test_command_writes_tests_and_says_so(tmp_path: Path) -> None:
     assert all(content.isascii() for content in written.values())
     header = written["rotary_pendulum.h"].decode()
     assert "theta  rad  arm angle about the vertical" in header
-    assert "voltage, V, at most 15 V, 400 V/s" in header
+    assert "voltage, at most 15 V, 400 V/s" in header
     invoke(*request, "--out", str(tmp_path / "again"))
     assert written == {p.name: p.read_bytes() for p in (tmp_path / "again").iterdir()}
+
+
+def test_the_header_of_a_file_says_where_zero_is_and_what_inputs_count_in(tmp_path: Path) -> None:
+    """Two targets of one file are two headers, with what a joint's input counts in."""
+    file = tmp_path / "cart.urdf"
+    file.write_text(
+        """<robot name="cart"><link name="rail"/>
+  <link name="cart"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1"/></inertial></link>
+  <link name="bar"><inertial><origin xyz="0 0 0.3"/><mass value="0.3"/>
+    <inertia ixx="0.01" iyy="0.01" izz="0.001"/></inertial></link>
+  <joint name="x" type="prismatic"><parent link="rail"/><child link="cart"/>
+    <axis xyz="1 0 0"/></joint>
+  <joint name="tilt" type="continuous"><parent link="cart"/><child link="bar"/>
+    <axis xyz="0 1 0"/></joint></robot>"""
+    )
+    code, _, error = invoke(f"{file}:x", "--out", str(tmp_path / "unlimited"))
+    assert code
+    assert "--limit x_force=10" in error
+    for target, place in (("upright", "tilt = 0 deg"), ("hanging", "tilt = 180 deg")):
+        out = tmp_path / target
+        code, _, _ = invoke(f"{file}:x@{target}", "--limit", "x_force=7", "--out", str(out))
+        assert code == 0
+        header = (out / "cart.h").read_text(encoding="ascii")
+        assert f"x = 0 m, {place} of the file" in header
+        assert "x_force on x" in header
+        assert "u[0]  x_force, at most 7 N\n" in header
 
 
 @pytest.mark.parametrize(
@@ -1376,7 +1407,7 @@ def test_words_of_a_user_stay_in_their_comment(words: str, tmp_path: Path) -> No
     """Names, units and descriptions neither end a comment nor begin one: the C compiles."""
     plain = ut.mechanisms.cart_pendulum()
     parameters = tuple(replace(p, unit=words, description=words) for p in plain.parameters)
-    odd = replace(plain, name=f"x {words}", parameters=parameters)
+    odd = replace(plain, name=f"x {words}", parameters=parameters, description=words)
     controller = EmbeddedController(odd, ut.first_surface(plain), ut.ReachingLaw())
     passed, said = Build(controller, tmp_path).self_test()
     assert passed, said

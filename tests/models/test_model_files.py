@@ -362,6 +362,27 @@ def test_an_equilibrium_that_the_inputs_cannot_hold_is_none(pole: Path) -> None:
         named(str(pole))
 
 
+def test_zero_is_no_target_where_the_mechanism_cannot_rest_there(tmp_path: Path) -> None:
+    """A rail from 0 or 0.5 to 2 m, and a level arm too heavy for its motor: zero was the target."""
+    text = """<mujoco><worldbody><body><joint name="slide" type="slide" axis="1 0 0" range="LOW 2"/>
+<geom type="sphere" size="0.1" mass="1"/><body><joint name="hinge" axis="0 1 0"/><geom mass="0.1"
+type="capsule" fromto="0 0 0 0 0 0.5" size="0.01"/></body></body></worldbody><actuator>
+<motor name="push" joint="slide" gear="10" ctrlrange="-1 1"/></actuator></mujoco>"""
+    file = tmp_path / "cart.xml"
+    for low, middle in (("-1", 0.0), ("0", 1.0), ("0.5", 1.25)):
+        file.write_text(text.replace("LOW", low))
+        assert origin(str(file)) == {"slide": middle, "hinge": 0.0}
+    arm = """<mujoco><worldbody><body><joint name="arm" axis="0 1 0"/><geom type="capsule" mass="2"
+fromto="0 0 0 1 0 0" size="0.02"/><body pos="1 0 0"><joint name="rod" axis="0 1 0"/><geom mass="0.1"
+type="capsule" fromto="0 0 0 0 0 -0.5" size="0.01"/></body></body></worldbody><actuator><motor
+name="push" joint="arm" ctrlrange="-MOST MOST"/></actuator></mujoco>"""
+    for most, level in (("20", True), ("5", False)):
+        file.write_text(arm.replace("MOST", most))
+        rig = named(f"{file}@nearest")
+        assert ("target zero" in rig.description) == level
+        assert np.abs(rig.f(np.zeros(4))[0]) < rig.input_limits[0]
+
+
 def test_a_servo_rests_where_its_input_is_zero(pole: Path) -> None:
     """Claim: on that slope a servo too weak to hold zero gives way until its spring bears the
     cart, by (m + M) g sin(30 deg) / kp; where the travel does not reach there, what would hold

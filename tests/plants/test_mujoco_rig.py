@@ -151,3 +151,24 @@ def test_the_cascade_balances_in_mujoco_without_retuning(name: str) -> None:
     from undertow.studies.trials.upright import engine_trial
 
     assert engine_trial(name, seconds=6.0, budget=128).outcome.balanced
+
+
+def test_a_mechanism_of_ones_own_under_a_name_of_the_library_has_no_scene() -> None:
+    """It would have been moved as the library's, or ended in a KeyError."""
+    plain = ut.mechanisms.cart_pendulum()
+    mujoco_scene(plain.with_parameters(b_p=0.1).with_disturbance_bounds(0.1, 0.0))
+    other = ut.Mechanism(
+        "cart_pendulum", plain.coordinates, plain.inputs, mass_matrix=plain.mass_matrix,
+        force=plain.force + sp.Matrix([-(plain.q[0] ** 3), 0]), input_matrix=plain.input_matrix,
+        parameters=plain.parameters,
+    )  # fmt: skip
+    for own in (other, ut.mechanisms.acrobot(), plain):
+        named = ut.Mechanism(
+            "cart_pendulum", own.coordinates, own.inputs, mass_matrix=own.mass_matrix,
+            force=own.force, input_matrix=own.input_matrix, parameters=own.parameters,
+        )  # fmt: skip
+        if own is plain:
+            assert mujoco_scene(named).xml == mujoco_scene(plain).xml
+        else:
+            with pytest.raises(InvalidInputError, match="with other equations"):
+                mujoco_scene(named)

@@ -380,9 +380,26 @@ def test_a_changed_definition_is_refused(serial: Path) -> None:
         ):
             with pytest.raises(ArtefactError, match=rf"another campaign.*{what}.*--out"):
                 Campaign(other, serial).run(pool, resume=True)
-        with pytest.raises(ArtefactError, match=r"there is one.*--resume"):
+        with pytest.raises(ArtefactError, match=r"a store that is there.*--resume"):
             Campaign(MAP, serial).run(pool)
+        with pytest.raises(ArtefactError, match=r"in the store.*that it was begun with"):
+            Campaign(Definition.of("cart_pendulum", **REGION), serial).dataset()
     assert content(serial) == before
+
+
+def test_a_folder_that_is_no_store_is_not_to_be_resumed(tmp_path: Path) -> None:
+    """It was: --resume then answered that there is no store."""
+    (tmp_path / "notes").mkdir()
+    with executor_for() as (pool, _), pytest.raises(ArtefactError, match="something else") as said:
+        Campaign(MAP, tmp_path / "notes").run(pool)
+    assert "--resume" not in str(said.value)
+
+
+def test_a_definition_without_a_mechanism_says_how_to_name_one(tmp_path: Path) -> None:
+    file = tmp_path / "map.toml"
+    file.write_text('kind = "region"')
+    with pytest.raises(InvalidInputError, match=r"got none.*or --mechanism"):
+        Definition.read(file)
 
 
 def test_two_campaigns_at_once_do_not_share_a_store(serial: Path) -> None:

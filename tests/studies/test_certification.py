@@ -273,6 +273,35 @@ def test_a_run_is_certified_with_the_law_that_it_had(run: ut.Run) -> None:
     assert {one.subject.reaching for one in certify_run(RIG, run, reaching_law=law)} == {law}
 
 
+def test_lemma_3_is_asked_of_its_own_case_alone(run: ut.Run) -> None:
+    """Another plant, and a target that moves, may raise predictions: nothing says ≥ 0 wanted."""
+    start, surface = RIG.state(phi=0.2), run.surfaces[0]
+
+    def shown(run: ut.Run, target: ut.Reference | None = None) -> str:
+        moved = run.trajectory
+        report = motion.motion_report(RIG, GOAL, start, moved, surface, run, None, target)
+        return " ".join(text(report).split())
+
+    assert "≥ 0 wanted" in shown(run)
+    heavy = replace(run.trajectory, mechanism=RIG.with_parameters(m=0.2))
+    other = shown(replace(run, trajectory=heavy))
+    assert "the plant, which is not the model, raised it by" in other
+    moving = shown(run, ut.Reference.sine(0.5, theta=0.1))
+    assert "the moving target raised it by" in moving
+    for said in (other, moving):
+        assert "wanted" not in said
+
+
+def test_a_cost_of_a_motion_that_did_not_arrive_says_so(run: ut.Run) -> None:
+    """Least time cost as long as the motion lasted, arrived or not."""
+    start = RIG.state(phi=0.2)
+    for event, words in ((ut.Event.REACHED, ""), (ut.Event.SINGULAR, ", without arriving")):
+        motion_there = replace(run.trajectory, event=event)
+        report = motion.motion_report(RIG, GOAL, start, motion_there, run.surfaces[0])
+        flat = " ".join(text(report).split())
+        assert f"cost {motion_there.cost:.6g} {GOAL.unit}{words} largest" in flat
+
+
 def test_friction_that_a_motion_leaves_out_is_told_of(run: ut.Run) -> None:
     """Only the line of what was left out of a file had it."""
     start, told = RIG.state(phi=0.2), "simulated without disturbances"

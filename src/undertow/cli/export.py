@@ -98,6 +98,7 @@ def export_c(
     compiler: str = "gcc",
     states: Annotated[int, typer.Option(min=1)] = 100_000,
     setting: options.Settings = None,
+    limit: options.Limits = None,
     seed: options.Seed = 0,
 ) -> None:
     """Write the inner loop in C99: no heap, no dependencies, limits, estimator, surface table.
@@ -187,7 +188,7 @@ def export_c(
         )
 
     names = list(LIBRARY) if every else [str(name)]
-    made = [controller(mechanism_named(n, setting)) for n in names]
+    made = [controller(mechanism_named(n, setting, limit)) for n in names]
     starts = (
         [parse_start(one.mechanism, start) for one in made] if start or rigs or bit_flips else []
     )

@@ -876,8 +876,8 @@ class ClosedLoop:
     ) -> Trajectory:
         n, m = self.mechanism.n, self.mechanism.m
         end = float(batch.time[0])
-        times = np.arange(len(record)) * (every * self.step)
-        rows = record[times < end - 1e-12]
+        times = np.arange(max(len(record), 1)) * (every * self.step)
+        rows = record[times[: len(record)] < end - 1e-12]
         if last is None:  # a held input is still the last one
             lines = [*rows[-1:], *record[:1], np.zeros(2 * n + 2 * m + 2)]
             last = lines[0].copy()

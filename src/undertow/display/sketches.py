@@ -13,6 +13,7 @@ from typing import Any, Literal
 import sympy as sp
 
 from undertow.closed_loop.figures import display
+from undertow.mechanisms import LIBRARY
 from undertow.models import Mechanism
 
 #: x, y, z as numbers or expressions, m.
@@ -89,11 +90,11 @@ class Sketch:
 def sketch(mechanism: Mechanism) -> Sketch:
     """Return the stick figure of a mechanism of the library, or dials for any other.
 
-    A dial is a hand that turns with an angle, or a bead on a rail: one for each coordinate,
-    with its name and unit below.
+    One about another target, or with another potential, is another.  A dial is a hand that turns
+    with an angle, or a bead on a rail: one for each coordinate, with its name and unit below.
     """
     known = _SKETCHES.get(mechanism.name)
-    if known is not None:
+    if known is not None and mechanism.potential == LIBRARY[mechanism.name]().potential:
         try:
             return known(_Symbols(mechanism))
         except KeyError:  # a mechanism of one's own under a name of the library

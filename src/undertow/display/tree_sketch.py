@@ -8,12 +8,13 @@ is a wheel; what slides is a box on a rail.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 import sympy as sp
 
 from undertow.display.sketches import Box, Disc, Line, Point, Sketch, View, sketch
-from undertow.mechanisms.named import tree_named
+from undertow.mechanisms.named import origin, tree_named
 from undertow.models import FloatArray, Mechanism
 from undertow.models.importers import Joint, Link, Tree
 from undertow.models.importers.rigid_body import identifier, rotation_about
@@ -30,16 +31,17 @@ def sketch_named(name: str, mechanism: Mechanism) -> Sketch:
     can be had. Names are those of :func:`undertow.mechanisms.named.named`.
     """
     tree = tree_named(name)
-    found = None if tree is None else tree_sketch(tree, mechanism)
+    found = None if tree is None else tree_sketch(tree, mechanism, origin(name))
     return sketch(mechanism) if found is None else found
 
 
-def tree_sketch(tree: Tree, mechanism: Mechanism) -> Sketch | None:
+def tree_sketch(tree: Tree, mechanism: Mechanism, at: Mapping[str, float]) -> Sketch | None:
     """Return a stick figure of a tree of bodies; ``None`` where coordinates are no joints.
 
-    Inputs that act on several joints at once change the coordinates to sums of joints.
+    ``at``: where the target is, in the joints' own positions, by coordinate. Inputs that act on
+    several joints at once change the coordinates to sums of joints.
     """
-    symbols = {c.name: c.symbol for c in mechanism.coordinates}
+    symbols = {c.name: c.symbol + at.get(c.name, 0.0) for c in mechanism.coordinates}
     names = {joint.name: identifier(joint.name) for joint in tree.moving}
     if {*names.values()} != {*symbols}:
         return None
@@ -89,7 +91,7 @@ def _point(place: sp.Matrix) -> Point:
     return place[0], place[1], place[2]
 
 
-def _poses(tree: Tree, angles: dict[str, sp.Symbol]) -> dict[str, tuple[sp.Matrix, sp.Matrix]]:
+def _poses(tree: Tree, angles: dict[str, sp.Expr]) -> dict[str, tuple[sp.Matrix, sp.Matrix]]:
     """Return rotation, (3, 3), and origin, (3,), of each link in the fixed frame."""
     poses = {WORLD: (sp.eye(3), sp.zeros(3, 1))}
     for joint in tree.ordered():

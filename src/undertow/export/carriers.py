@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from undertow.base import InvalidInputError, one_of
 from undertow.export.controller import EmbeddedController
 from undertow.export.fmi import fmi_units
-from undertow.export.names import ascii_words, c_name
+from undertow.export.names import ascii_words, at_most, c_name
 from undertow.export.sources import common, controller_files, render
 
 
@@ -87,9 +87,7 @@ def ros2_package(controller: EmbeddedController) -> dict[str, bytes]:
         # Quoted: in YAML y and n are truths.
         "joints": ", ".join(f'"{c_name(c.name)}"' for c in mechanism.coordinates),
         "units": ", ".join(c.unit for c in mechanism.coordinates),
-        "inputs": ", ".join(
-            ascii_words(f"{u.name} ({u.unit}, at most {u.limit:g})") for u in mechanism.inputs
-        ),
+        "inputs": ", ".join(ascii_words(f"{u.name} ({at_most(u)})") for u in mechanism.inputs),
     }
     places = {
         "package.xml": "ros2_package.xml",

@@ -17,7 +17,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import InvalidInputError, one_for_each, one_of, positive, require
+from undertow.base import InvalidInputError, check_fields, one_for_each, one_of, positive, require
 from undertow.export.estimate import DerivativeStep, EstimatorStep, KalmanStep
 from undertow.export.names import HEADERS, c_name
 from undertow.law import (
@@ -122,19 +122,29 @@ class EmbeddedController:
 
     def __post_init__(self) -> None:
         """Refuse what cannot run: see the class."""
+        check_fields(
+            self, "mechanism", "surface", "period", "slew", "missed", "rows", "real", "prefix"
+        )
+        require(
+            hasattr(self.differentiator, "gains"),
+            "differentiator",
+            repr(self.differentiator),
+            "undertow.export.DerivativeStep(), SuperTwistingStep() or KalmanStep()",
+        )
         limits = self.mechanism.input_limits
         built_in = len(self.plan.surfaces)
         named = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,15}", self.prefix)
         rows, plan_to_most = self.most_rows, f"{built_in} (those of the plan) to 64"
         require(0 < self.period < 1, "period of the exported loop", self.period, "> 0, < 1 s")
-        require(self.missed >= 0, "missed periods", self.missed, "0 or more")
+        require(0 <= self.missed < 2**15 - 1, "missed periods", self.missed, "0 to 32766")
         one_of("real", self.real, ("double", "float"))
         require(named, "prefix", repr(self.prefix), "a C name of at most 16 letters")
         require(built_in <= rows <= 64, "rows of the surface table", rows, plan_to_most)
         positive(
             f"input limits of '{self.mechanism.name}'",
             limits,
-            "Name what the actuators can deliver: mechanism.with_input_limit",
+            "Name what the actuators can deliver: mechanism.with_input_limit, "
+            f"--limit {self.mechanism.inputs[0].name}=10",
         )
         if self.reaching is None:
             law = usual_reaching(self.mechanism, self.plan.surfaces[0], period=self.period)

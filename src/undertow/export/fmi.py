@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from undertow.export.co_simulation import Groups, Unit, Variable
 from undertow.export.controller import EmbeddedController, plan_numbers
 from undertow.export.estimate import acceleration_code
+from undertow.export.names import at_most
 from undertow.export.sources import common, controller_files, helpers
 from undertow.models import Coordinate, Mechanism, longest_step
 
@@ -88,9 +89,7 @@ def controller_variables(controller: EmbeddedController) -> Groups:
                 for index, v in zip(numbers, values, strict=True)
             ),
         ],
-        "OUTPUTS": [
-            output(u.name, u.unit, f"at most {u.limit:g} {u.unit}") for u in mechanism.inputs
-        ],
+        "OUTPUTS": [output(u.name, u.unit, at_most(u)) for u in mechanism.inputs],
         "STATUS": [output("loop.status", "", bits, "Int32")],
         "S": [output(f"loop.s{index}", "", "value of the surface") for index in numbers],
         "MARGIN": [output("loop.margin", "", "det Γ(q)/det Γ(0): > 0 where the law exists")],

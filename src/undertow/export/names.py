@@ -11,7 +11,7 @@ from string import Template
 
 import sympy as sp
 
-from undertow.models import Parameter
+from undertow.models import Input, Parameter
 
 #: A measurement beyond is no number either.
 LARGEST = 1e9
@@ -49,6 +49,10 @@ class PlanAnswer(IntEnum):
 HEADERS = {"math", "signal", "stdio", "stdlib", "simstruc", "fmi3", "unit", "model"}
 
 
+#: Signs of units and formulas, as words in ASCII have them.
+_SPELLED = {"²": "^2", "³": "^3", "·": " ", "Ω": "Ohm", "°": " deg", "×": "x", "≤": "<=", "±": "+-"}
+
+
 def _letter(sign: str) -> str:
     """Return an ASCII spelling of one letter: Greek by its name, others without accents."""
     if sign.isascii():
@@ -72,10 +76,15 @@ def macros(parameters: Iterable[Parameter]) -> dict[sp.Symbol, str]:
 
 def ascii_words(text: str) -> str:
     """Return words in ASCII that neither begin nor end a comment, and hold no trigraph."""
-    for sign, words in {"²": "^2", "³": "^3", "·": " ", "Ω": "Ohm"}.items():
+    for sign, words in _SPELLED.items():
         text = text.replace(sign, words)
     plain = "".join(map(_letter, text)).replace("\\", "/")  # first: "*\" would become an end
     return " ".join(re.sub(r"[*](?=/)|/(?=[*])|[?](?=[?])", r"\g<0> ", plain).split())
+
+
+def at_most(channel: Input) -> str:
+    """Return the limit of an input, with its unit where it has one."""
+    return f"at most {channel.limit:g} {channel.unit}".rstrip()
 
 
 def template(name: str, prefix: str = "ut") -> Template:

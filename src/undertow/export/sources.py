@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import math
 import re
+import textwrap
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import sympy as sp
 
-from undertow.base import checked, versions, write_files
+from undertow.base import checked, one_of, versions, write_files
 from undertow.export.controller import FACTOR, WIDTH, EmbeddedController, plan_text
 from undertow.export.estimate import estimate_code
-from undertow.export.names import LARGEST, ascii_words, c_name, macros, prefixed, template
+from undertow.export.names import LARGEST, ascii_words, at_most, c_name, macros, prefixed, template
 from undertow.export.routh import characteristic_polynomial
 from undertow.export.twin import vectors
 from undertow.law import LawSymbols, Plan, Surface, build_law_graph
@@ -28,6 +30,7 @@ from undertow.symbolic import C99Emitter, Tape, literal
 _WORDS = {
     "name",
     "title",
+    "about",
     "coordinates",
     "inputs",
     "estimator",
@@ -84,6 +87,9 @@ def export_c(
     SingularSurfaceError, UnstableSurfaceError
         When the law does not exist at the target, or the motion does not die out there.
     """
+    known = [field.name for field in fields(EmbeddedController)][2:]
+    for name in settings:
+        one_of("setting of export_c", name, known)
     write_files(Path(folder), files(EmbeddedController(mechanism, surface, **settings)))
     return Path(folder)
 
@@ -108,7 +114,7 @@ def controller_files(controller: EmbeddedController) -> dict[str, bytes]:
     """Return ``<name>.h`` and ``<name>.c`` alone."""
     mechanism, real = controller.mechanism, controller.real
     name, prefix = controller.stem, controller.prefix
-    shared = common(controller)
+    shared = common(controller) | {"about": _about(mechanism)}
     plan = plan_text(controller, controller.plan, controller.number)
     code = _generated_parts(controller)
     used = "\n".join(code.values())
@@ -153,6 +159,12 @@ def controller_files(controller: EmbeddedController) -> dict[str, bytes]:
     }
 
 
+def _about(mechanism: Mechanism) -> str:
+    """Return what the mechanism's description says: of a file's where zero is, how inputs scale."""
+    lines = [ascii_words(line) for line in mechanism.description.splitlines()]
+    return "".join(f"\n *   {part}" for line in lines for part in textwrap.wrap(line, 94))
+
+
 def _coordinates(mechanism: Mechanism) -> str:
     width = max(len(c.name) for c in mechanism.coordinates)
     return "\n".join(
@@ -166,9 +178,8 @@ def _inputs(controller: EmbeddedController) -> str:
     for i, (channel, slew) in enumerate(
         zip(controller.mechanism.inputs, controller.slew_rates, strict=True)
     ):
-        unit = ascii_words(channel.unit)
-        line = f" *   u[{i}]  {c_name(channel.name)}, {unit}, at most {channel.limit:g} {unit}"
-        lines.append(line + f", {slew:g} {unit}/s" * math.isfinite(slew))
+        line = f" *   u[{i}]  {c_name(channel.name)}, {ascii_words(at_most(channel))}"
+        lines.append(line + f", {slew:g} {ascii_words(channel.unit)}/s" * math.isfinite(slew))
     return "\n".join(lines)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from undertow.base import InvalidInputError, one_of
@@ -53,12 +53,16 @@ def named(name: str) -> Mechanism:
 def tree_named(name: str) -> Tree | None:
     """Return the bodies and joints that a name means; ``None`` where it is not such a file.
 
+    Joints that are frozen are fixed.
+
     Raises InvalidInputError, ModelError or ArtefactError as for :func:`named`.
     """
     data = DataName.of(name)
     if in_a_file(name) or data is None:
         return None
-    return format_of(data.file).tree(data.file, not data.actuated)
+    tree = format_of(data.file).tree(data.file, not data.actuated)
+    fixed = (replace(j, kind="fixed") if j.name in data.frozen else j for j in tree.joints)
+    return replace(tree, joints=tuple(fixed))
 
 
 def origin(name: str) -> dict[str, float]:

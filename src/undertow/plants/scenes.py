@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from undertow.base import one_of
+from undertow.base import one_of, require
+from undertow.mechanisms import LIBRARY
 from undertow.models import FloatArray, Mechanism
 
 #: MuJoCo refuses moments of inertia of exactly zero.
@@ -35,10 +36,19 @@ class Scene:
 def mujoco_scene(mechanism: Mechanism) -> Scene:
     """Return the MuJoCo scene of a mechanism of the library, with its present parameters.
 
-    Raises InvalidInputError for a mechanism that is not of the library.
+    Raises InvalidInputError for a mechanism that is not of the library, whatever it is called.
     """
-    own = "Bring an MJCF file of your own: undertow.models.importers.from_mjcf"
+    own = "Bring an MJCF file of your own: MuJoCoRig(scene=FILE), undertow run --rig FILE.xml"
     one_of("MuJoCo scene", mechanism.name, _SCENES, own)
+    known = LIBRARY[mechanism.name]()
+    parts = ("q", "parameter_symbols", "mass_matrix", "force", "input_matrix")
+    require(
+        all(getattr(mechanism, part) == getattr(known, part) for part in parts),
+        f"MuJoCo scene for '{mechanism.name}'",
+        "a mechanism of that name with other equations",
+        "the library's",
+        own,
+    )
     values = {p.name: p.value for p in mechanism.parameters}
     bodies, motors, joints = _SCENES[mechanism.name](values)
     limits = [

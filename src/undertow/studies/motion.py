@@ -127,9 +127,11 @@ def motion_report(
         if any(verdict is not None for verdict in run.verdicts):
             rows.append(("evidence", evidence_counts(run)))
         if len(run.lemma3_slack):
-            rows.append(_descent(run, objective, learns=bool(cascade and cascade.known)))
+            learns = bool(cascade and cascade.known)
+            rows.append(_descent(run, objective, _risen(mechanism, run, target, learns=learns)))
+    good = motion.event == Event.REACHED
     rows += [
-        ("cost", f"{motion.cost:.6g} {objective.unit}"),
+        ("cost", f"{motion.cost:.6g} {objective.unit}" + ", without arriving" * (not good)),
         (
             "largest input",
             ", ".join(
@@ -140,7 +142,6 @@ def motion_report(
             ),
         ),
     ]
-    good = motion.event == Event.REACHED
     said = ended(motion, objective, target)
     end = Text(said) if good and motion.time == motion.t[0] else mark(good) + Text(f" {said}")
     return Group(facts(rows), end, *map(Text, _undisturbed(mechanism)))
@@ -163,15 +164,31 @@ def _undisturbed(mechanism: Mechanism) -> list[str]:
     ]
 
 
-def _descent(run: Run, objective: Objective, *, learns: bool) -> tuple[str, str]:
+def _risen(mechanism: Mechanism, run: Run, target: Target | None, *, learns: bool) -> str:
+    """Say what may raise predictions; nothing where Lemma 3 is about the run.
+
+    It is of one model, which moves as predicted, and of a target that rests.
+    """
+    plant = run.trajectory.mechanism
+    end = max(run.time, 1.0)
+    if learns:
+        return "what was learnt"
+    if plant.identity != mechanism.identity:
+        return "the plant, which is not the model,"
+    if target is not None and any(leg.moves for _, leg in target.legs(mechanism, end)):
+        return "the moving target"
+    return ""
+
+
+def _descent(run: Run, objective: Objective, risen: str) -> tuple[str, str]:
     """Say by how much predictions fall at least, or rise, from one decision to the next.
 
-    Lemma 3 is of one model; one that is learnt predicts afresh with all that it learns.
+    ``risen``: what may raise them, where it is not the case of Lemma 3.
     """
     slack = run.lemma3_slack
     known = slack[np.isfinite(slack)]
     unknown = len(slack) - len(known)
-    name = "prediction" if learns else "Lemma 3"
+    name = "prediction" if risen else "Lemma 3"
     without = (
         f"; {unknown} of {len(slack)} decisions begin another task or lack a finite prediction"
         if unknown and run.updates[-1].task
@@ -182,13 +199,10 @@ def _descent(run: Run, objective: Objective, *, learns: bool) -> tuple[str, str]
     if not len(known):
         return name, f"no slack is known{without}"
     least = f"{known.min():.1e} {objective.unit}"
-    if not learns:
+    if not risen:
         return name, f"smallest slack {least} (≥ 0 wanted, to rounding){without}"
     rise = f"{max(0.0, -known.min()):.1e} {objective.unit}"
-    return (
-        name,
-        f"what was learnt raised it by {rise} at most, from one decision to the next{without}",
-    )
+    return name, f"{risen} raised it by {rise} at most, from one decision to the next{without}"
 
 
 #: Kinds of evidence, in words.

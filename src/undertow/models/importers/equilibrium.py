@@ -171,10 +171,11 @@ def _unwound(mechanism: Mechanism, found: dict[str, float], guess: FloatArray) -
 
 
 def _nearest_first(mechanism: Mechanism) -> Iterator[FloatArray]:
-    """Zero where it is an equilibrium, then those that are found, which takes longer."""
-    rests = _rests(mechanism)
+    """Zero where it is one of those that are looked for, then the others, which takes longer."""
+    zero = np.zeros(mechanism.n)
+    rests = _rests(mechanism) and not _obstacle(mechanism, zero)[0]
     if rests:
-        yield np.zeros(mechanism.n)
+        yield zero
     yield from (e.q for e in _equilibria(mechanism) if np.any(e.q) or not rests)
 
 
@@ -484,15 +485,15 @@ def move_target(mechanism: Mechanism, /, **equilibrium: float) -> Mechanism:
     Returns
     -------
     Mechanism
-        Its coordinates keep their names and read zero at the new target.  The start state is
-        dropped: it belonged to the old one.
+        Its coordinates keep their names and read zero at the new target, which its description
+        says.  The start state is dropped: it belonged to the old one.
 
     Raises
     ------
     ModelError
         When it is no equilibrium of the free coordinates, f_u ≠ 0.
     """
-    _positions(mechanism, equilibrium)
+    place = f"target {_position(mechanism, _positions(mechanism, equilibrium))} of the old one"
     coordinates, (mass, force, potential) = shifted(
         mechanism.name,
         mechanism.coordinates,
@@ -508,6 +509,7 @@ def move_target(mechanism: Mechanism, /, **equilibrium: float) -> Mechanism:
         force=force,
         potential=potential,
         start={},
+        description="\n".join(filter(None, (mechanism.description, place))),
     )
     check_balanced(moved)
     return moved

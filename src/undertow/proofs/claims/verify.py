@@ -73,7 +73,8 @@ def match(
     present = {p.name: p.value for p in mechanism.parameters}
     wanted = ", ".join(repr(key) for key in sorted(own.parameters))
     alike = set(present) == set(own.parameters)
-    _require(alike, f"parameters of '{name}'", ", ".join(sorted(present)), wanted)
+    whose = "Name the mechanism that it is about, NAME or FILE: undertow verify --mechanism"
+    _require(alike, f"parameters of '{name}'", ", ".join(sorted(present)), wanted, whose)
     changed = {k: v for k, v in own.parameters.items() if present[k] != v}
     for key, value in changed.items() if own_parameters else ():
         what, limit = f"parameter '{key}' of '{name}'", f"{value:.17g}, the certificate's"

@@ -71,7 +71,10 @@ class Definition:
             said.pop("mechanisms", None)
         if not isinstance(name, str):
             raise InvalidInputError(
-                f"mechanism of the campaign '{path}'", value=name, limit="a name, like 'acrobot'"
+                f"mechanism of the campaign '{path}'",
+                value="none" if name is None else name,
+                limit="a name, like 'acrobot'",
+                remedy="Say mechanism = 'acrobot' in the file, or --mechanism",
             )
         if mechanism is None:
             name = _of_data(name, path)

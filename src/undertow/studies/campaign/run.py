@@ -34,7 +34,7 @@ from undertow.studies.campaign.designs import Designs
 from undertow.studies.campaign.league import League
 from undertow.studies.campaign.random_plants import RandomPlants
 from undertow.studies.campaign.region_map import RegionMap
-from undertow.studies.campaign.store import DONE, SHARD, Store, dataset, digest
+from undertow.studies.campaign.store import DONE, PARTS, SHARD, Store, dataset, digest
 from undertow.studies.campaign.study import Arrays, Study
 from undertow.studies.experiment import Serial, ended
 from undertow.symbolic import processor
@@ -213,10 +213,11 @@ class Campaign:
         for name, mine in self.about.items():
             if data.attrs.get(name) != mine:
                 raise ArtefactError(
-                    f"{name} in the store '{self.path}'",
+                    f"{PARTS.get(name, name)} in the store '{self.path}'",
                     value=data.attrs.get(name),
                     limit=mine,
-                    remedy="Name the store of this campaign with --out",
+                    remedy="Give the file, --mechanism and --entrant that it was begun with, or "
+                    "name another store with --out",
                 )
         return data
 

@@ -101,11 +101,14 @@ class Store:
             When there is something already, or it cannot be written.
         """
         if path.exists():
+            one = (path / "zarr.json").is_file()
             raise ArtefactError(
                 f"store '{path}'",
-                value="there is one",
+                value="a store that is there" if one else "something else that is there",
                 limit="a new folder",
-                remedy="Go on with it: --resume; or name another with --out",
+                remedy="Go on with it: --resume; or name another with --out"
+                if one
+                else "Name another with --out",
             )
         zarr = _zarr()
         making = path.with_name(f".{path.name}.{os.getpid()}")

@@ -534,7 +534,7 @@
     chart("ms", [line(0, "ms", { paths: uPlot.paths.bars({ size: [0.6, 9], align: 0 }), fill: () => colour("--blue"), width: 0 })], [axisOf("ms", "", 3, (u, k, low, high) => [0, nice(0.9 * high)])],
       { ms: { range: (u, low, high) => [0, 1.15 * Math.max(high ?? 0, 5)] } });
   }
-  const biggest = (one) => { const k = hello.inputs.indexOf(one); return Math.max(0.1, ...frames.slice(-480).map((f) => Math.abs(f.u[k]))); };
+  const biggest = (one) => { const k = hello.inputs.indexOf(one); return Math.max(0.1, ...(live ? frames.slice(-480) : frames).map((f) => Math.abs(f.u[k]))); };
   function makeLegends() {
     const entry = (k, text) => {
       const one = document.createElement("span"), mark = document.createElement("i"), dash = STYLES[k % STYLES.length][1];
