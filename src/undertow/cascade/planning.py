@@ -55,6 +55,11 @@ class Found(NamedTuple):
     cost: float
     proposal: Proposal
 
+    @property
+    def keeps_promise(self) -> bool:
+        """Whether the plan does what the search said of it."""
+        return math.isfinite(self.cost) and self.cost <= AGREES * self.proposal.cost
+
 
 class Planning:
     """The searches of a cascade.
@@ -113,6 +118,8 @@ class Planning:
             found = tries[-1].proposal if tries else None
             if loop is single and found is not None and found.plan is not None:
                 break
+            if fixed is not None and not here.price_of_time > 0 and tries[-1].keeps_promise:
+                continue  # smaller steps find nothing else
             about, planner = predictions.about(loop, target, t), planners.of(loop, target, t)
             if fixed is not None:
                 planner = planners.suited(fixed).on(predictions.about(fixed, target, t))
