@@ -195,6 +195,14 @@ def test_after_a_knock_a_plan_in_reserve_takes_over_and_a_decision_comes_early()
     assert controller.mode in (Mode.CATCH, Mode.BALANCE)
 
 
+def test_what_a_recipe_starts_with_depends_on_it_alone() -> None:
+    """To the bit, so that the tests may search once for each recipe: ``first_once`` in conftest."""
+    made = RECIPE.first()
+    again = vars(Recipe.first)["__wrapped__"](replace(RECIPE))
+    assert replace(again, estimate=made.estimate) == made
+    assert str(again.estimate) == str(made.estimate)
+
+
 @pytest.mark.parametrize(("asked", "kept"), [(0.5, 0.5), (1.5, math.radians(60.0))])
 def test_with_a_swing_up_the_smaller_angle_has_fallen(asked: float, kept: float) -> None:
     """That of the settings was passed over."""
