@@ -14,7 +14,7 @@ from undertow.base import InvalidInputError
 from undertow.models import FloatArray
 
 RIG = ut.mechanisms.rotary_pendulum()
-GOAL = ut.objective_for(RIG, "effort", horizon=10.0)
+GOAL = ut.objective_for(RIG, "bench-energy", horizon=10.0)
 SURFACE = ut.first_surface(RIG)
 FREE = RIG.with_input_limit(np.inf)
 QUICK = ut.Plan((SURFACE,), reaching=(ut.ReachingLaw(200.0, 0.2),))

@@ -43,6 +43,13 @@ class Watch:
 
 
 @pytest.fixture(scope="module")
+def swinging(cascade: ut.Cascade) -> ut.Cascade:
+    """Least energy within 3 s, without an end of the rail, to a large terminal set."""
+    goal = replace(ut.objective_for(FREE, "bench-energy", horizon=3.0), terminal_radius=0.3)
+    return replace(cascade, mechanism=FREE, objective=goal, cold=ut.Budget(512), period=0.5)
+
+
+@pytest.fixture(scope="module")
 def run(cascade: ut.Cascade) -> ut.Run:
     return cascade.simulate(CRANE.state(), target=JUMPS, duration=16.0)
 
@@ -89,10 +96,8 @@ def test_a_jump_begins_a_new_task_for_lemma_3(run: ut.Run) -> None:
     assert np.nanmin(run.lemma3_slack) >= -1e-9
 
 
-def test_to_come_back_there_is_a_whole_horizon(cascade: ut.Cascade) -> None:
+def test_to_come_back_there_is_a_whole_horizon(swinging: ut.Cascade) -> None:
     """A load that swings in and out of the terminal set: each time it left, a task afresh."""
-    goal = replace(ut.objective_for(FREE, "bench-energy", horizon=3.0), terminal_radius=0.3)
-    swinging = replace(cascade, mechanism=FREE, objective=goal, cold=ut.Budget(512), period=0.5)
     watch = Watch(swinging.optimiser)
     swinging = replace(swinging, planner=watch)
     run = swinging.simulate(CRANE.state(theta_dot=1.0), target={"x": 0.0}, duration=5.0)
@@ -165,10 +170,11 @@ def test_what_takes_over_after_a_jump_is_chosen_by_its_size() -> None:
 
 
 def test_what_takes_over_after_a_jump_is_chosen_anew_for_another_target(
-    cascade: ut.Cascade,
+    swinging: ut.Cascade,
 ) -> None:
     """It stayed what had been chosen on the way to the first target."""
-    stale, x = ut.Plan.of(cascade.optimiser.anchor), CRANE.state(theta=0.05)
+    cascade, x = swinging, CRANE.state(theta=0.05)
+    stale = ut.Plan.of(cascade.optimiser.anchor)
     memory = replace(CascadeState(stale), after_jump=((math.inf, stale),))
     there = ReferenceMotion.at_rest(np.array([0.5, 0.0]))
     answer = respond(cascade, Request(0.0, x, 0.0, memory, target=there))
@@ -274,7 +280,7 @@ def test_a_refusal_tells_what_the_plan_in_use_costs_along_the_reference(
 ) -> None:
     """Not what the gate says of it about the target at rest."""
     cascade = ut.Cascade(
-        rig, ut.objective_for(rig, "effort"), belief="exact",
+        rig, ut.MinimumTime(), belief="exact",
         gate=lambda *_: Admission(False, "no", 1.0),
     )  # fmt: skip
     target = ut.Reference.sine(0.5, theta=0.3).legs(rig, 4.0)[0][1]

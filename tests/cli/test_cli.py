@@ -26,6 +26,7 @@ from typer.main import get_command
 
 import undertow as ut
 from runs import run
+from support import rest_slow
 from undertow.base import ArtefactError, InvalidInputError, table, write_file
 from undertow.cli import _ORDER, _place, app, main, terminal
 from undertow.cli.parsing import (
@@ -467,7 +468,7 @@ ARM = """<robot name="arm">
 </robot>"""
 
 
-@pytest.mark.parametrize("control", ["designed", "cascade"])
+@pytest.mark.parametrize("control", rest_slow(["designed", "cascade"], "designed"))  # its kernel
 def test_a_model_file_with_dry_friction_gets_the_layer_that_it_asks_for(
     tmp_path: Path, control: str
 ) -> None:

@@ -8,6 +8,7 @@ import sympy as sp
 from scipy.linalg import solve_continuous_are
 
 import undertow as ut
+from support import rest_slow
 from undertow.base import InvalidInputError
 from undertow.cascade.reserve import stiffer
 from undertow.cascade.robustness import sticking_distance
@@ -97,10 +98,11 @@ def test_on_a_rig_rates_are_free_where_errors_cost_what_they_do_in_effort(
     assert suited.freedom.rate is rate
 
 
-def test_a_cost_of_one_s_own_frees_rates_where_it_weighs_every_coordinate() -> None:
+@pytest.mark.parametrize("name", rest_slow(["overhead_crane", "cart_pendulum"], "cart_pendulum"))
+def test_a_cost_of_one_s_own_frees_rates_where_it_weighs_every_coordinate(name: str) -> None:
     """A hundredth of the full input's cost for each unit of error, on cranes as on pendulums."""
-    crane = ut.mechanisms.overhead_crane()
-    limit = crane.input_limits[0]
+    mechanism = ut.mechanisms.LIBRARY[name]()
+    limit = mechanism.input_limits[0]
 
     def weighing(place: float, angle: float) -> ut.Objective:
         def stage(v: Names) -> sp.Expr:
@@ -110,8 +112,8 @@ def test_a_cost_of_one_s_own_frees_rates_where_it_weighs_every_coordinate() -> N
         return ut.Objective("own", stage)
 
     for place, angle, rate in ((0.01, 0.01, True), (0.02, 0.005, False), (0.0, 1.0, False)):
-        cascade = ut.Cascade(crane, weighing(place, angle))
-        suited = for_rig(cascade, estimator_for(crane, bench_for(crane)))
+        cascade = ut.Cascade(mechanism, weighing(place, angle))
+        suited = for_rig(cascade, estimator_for(mechanism, bench_for(mechanism)))
         assert suited.freedom.rate is rate
 
 

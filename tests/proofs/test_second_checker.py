@@ -657,7 +657,7 @@ def evaluated(program: Path, cases: list[Document], file: Path) -> list[list[str
 
 
 @needs_compiler
-@pytest.mark.parametrize("count", [400, pytest.param(2000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", rest_slow([150, 2000], 150))
 def test_expressions_are_enclosed_with_their_derivatives(
     program: Path, tmp_path: Path, count: int
 ) -> None:
