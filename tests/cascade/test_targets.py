@@ -130,6 +130,7 @@ def test_a_set_point_is_0_seen_from_elsewhere() -> None:
     assert {update.task for update in there.updates} == {0}
 
 
+@pytest.mark.slow  # two kernels of its own; a map about a target keeps within it, too
 def test_what_takes_over_after_a_jump_keeps_within_the_travel_about_a_target_too() -> None:
     """It is what a cart with its rail moved by as much has at x = 0: 95 % of ±1.5 m less 1.2 m."""
     here = ut.mechanisms.cart_pendulum()
@@ -308,6 +309,7 @@ def test_the_travel_is_a_constraint_about_a_target_too() -> None:
     assert "1.425 m" in travel.name
 
 
+@pytest.mark.slow  # a kernel of its own
 def test_about_a_target_plausible_plants_have_their_errors_too() -> None:
     """Small ones of state and surface, which a belief adds: about x = 0 nothing is otherwise."""
     cart = ut.mechanisms.cart_pendulum()
@@ -335,7 +337,7 @@ def test_what_is_predicted_in_one_go_is_predicted_in_two(
     rig: ut.Mechanism, quick: ut.Surface, target: ut.Reference | None
 ) -> None:
     """Flows compose, whenever they begin; beside a target that moves, too."""
-    cascade = ut.Cascade(rig, ut.objective_for(rig, "effort"), belief="exact")
+    cascade = ut.Cascade(rig, ut.MinimumTime(), belief="exact")
     motion = None if target is None else target.legs(rig, 4.0)[0][1]
     state, error = CascadeState(ut.Plan.of(quick), target=motion), rig.state(phi=0.2)
     halfway = cascade.predicted_error(state, error, 1.0, 1.2)
