@@ -444,6 +444,7 @@ def test_earlier_results_are_kept_and_said_where(tmp_path: Path) -> None:
     assert (tmp_path / "earlier-2" / "motion.csv").exists()
 
 
+@pytest.mark.slow  # as test_words and the quick start of the README do
 def test_simulate_with_no_further_choice_runs_the_cascade() -> None:
     """A name and a start are enough: it designs, optimises and arrives."""
     code, out, _ = run(

@@ -98,7 +98,9 @@ def test_on_a_rig_rates_are_free_where_errors_cost_what_they_do_in_effort(
     assert suited.freedom.rate is rate
 
 
-@pytest.mark.parametrize("name", rest_slow(["overhead_crane", "cart_pendulum"], "cart_pendulum"))
+@pytest.mark.parametrize(
+    "name", rest_slow(["overhead_crane", "rotary_pendulum"], "rotary_pendulum")
+)
 def test_a_cost_of_one_s_own_frees_rates_where_it_weighs_every_coordinate(name: str) -> None:
     """A hundredth of the full input's cost for each unit of error, on cranes as on pendulums."""
     mechanism = ut.mechanisms.LIBRARY[name]()

@@ -302,6 +302,7 @@ def test_the_terminal_set_shrinks_from_sample_to_sample() -> None:
         assert words in why
 
 
+@pytest.mark.slow
 def test_one_terminal_set_is_found_for_every_damping_within_30_percent() -> None:
     """That of the law's own plant, however small, is none; in simulation the one found is one."""
     loop = HeldLoop(MODEL, NUMBERS, PERIOD, within("3/10", "d_e"))

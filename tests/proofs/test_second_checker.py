@@ -773,6 +773,7 @@ def test_mechanisms_are_decided_alike(
     assert min(decided.values()) >= 2 * len(names), decided
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_regions_on_the_surface_are_decided_and_larger_ones_refused(
     program: Path, tmp_path: Path

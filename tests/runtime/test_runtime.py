@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 
 import undertow as ut
 from runs import RECIPE
-from support import rest_slow
 from undertow.base import InvalidInputError
 from undertow.cascade import Admission, CascadeState
 from undertow.cascade.swing_up import Gains
@@ -491,7 +490,8 @@ def test_an_answer_for_another_state_is_refused_at_its_time(controller: Controll
 # -- other mechanisms ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("period", "least"), rest_slow([(0.004, 10), (0.01, 3)], (0.01, 3)))
+@pytest.mark.slow
+@pytest.mark.parametrize(("period", "least"), [(0.004, 10), (0.01, 3)])
 def test_a_slow_loop_is_optimised_as_a_quick_one_is(period: float, least: int) -> None:
     """At 250 and 100 Hz plans are admitted, and the output does not chatter between samples."""
     with session(replace(RECIPE, period=period), simulated=True) as runtime:
