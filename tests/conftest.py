@@ -7,6 +7,7 @@ import gc
 import os
 import random
 import time
+from dataclasses import fields
 from typing import TYPE_CHECKING
 
 import pytest
@@ -18,8 +19,11 @@ import compiled_lines
 import undertow as ut
 from undertow.cascade import CascadeState
 from undertow.law import Plan
+from undertow.runtime import Recipe
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from undertow.runtime import Controller
 
 # The same examples on every run: a failure on one machine is a failure on all.
@@ -76,6 +80,28 @@ def pytest_configure(config: pytest.Config) -> None:
     cache = getattr(config, "cache", None)  # absent with -p no:cacheprovider
     if cache is not None:
         os.environ.setdefault("UNDERTOW_CACHE", str(cache.mkdir("kernels")))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def first_once() -> Iterator[None]:
+    """What a recipe of the library's names starts with depends on it alone: tests share it."""
+    found: dict[str, CascadeState] = {}
+    searched = Recipe.first
+
+    @functools.wraps(searched)
+    def first(recipe: Recipe) -> CascadeState:
+        parts = {part.name: getattr(recipe, part.name) for part in fields(recipe)}
+        named = isinstance(recipe.mechanism, str) and isinstance(recipe.objective, str)
+        own = recipe.design or recipe.estimator or isinstance(recipe.target, ut.Reference)
+        if own or not named or recipe.mechanism not in ut.mechanisms.LIBRARY:
+            return searched(recipe)
+        if repr(parts) not in found:
+            found[repr(parts)] = searched(recipe)
+        return found[repr(parts)]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Recipe, "first", first)
+        yield
 
 
 @pytest.fixture(scope="session")

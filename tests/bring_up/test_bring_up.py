@@ -135,7 +135,7 @@ def test_the_fewest_faults_explain_the_gains(inputs: list[float], encoders: list
 @pytest.mark.parametrize(
     ("fault", "found"),
     [
-        ("voltage=-1", ("input sign", "voltage")),
+        pytest.param("voltage=-1", ("input sign", "voltage"), marks=pytest.mark.slow),
         ("phi=0", ("encoder", "phi")),
         pytest.param("voltage=0", ("input", "voltage"), marks=pytest.mark.slow),
         pytest.param("friction=20", ("breakaway", "voltage"), marks=pytest.mark.slow),

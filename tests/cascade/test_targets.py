@@ -43,6 +43,13 @@ class Watch:
 
 
 @pytest.fixture(scope="module")
+def swinging(cascade: ut.Cascade) -> ut.Cascade:
+    """Least energy within 3 s, without an end of the rail, to a large terminal set."""
+    goal = replace(ut.objective_for(FREE, "bench-energy", horizon=3.0), terminal_radius=0.3)
+    return replace(cascade, mechanism=FREE, objective=goal, cold=ut.Budget(512), period=0.5)
+
+
+@pytest.fixture(scope="module")
 def run(cascade: ut.Cascade) -> ut.Run:
     return cascade.simulate(CRANE.state(), target=JUMPS, duration=16.0)
 
@@ -89,10 +96,8 @@ def test_a_jump_begins_a_new_task_for_lemma_3(run: ut.Run) -> None:
     assert np.nanmin(run.lemma3_slack) >= -1e-9
 
 
-def test_to_come_back_there_is_a_whole_horizon(cascade: ut.Cascade) -> None:
+def test_to_come_back_there_is_a_whole_horizon(swinging: ut.Cascade) -> None:
     """A load that swings in and out of the terminal set: each time it left, a task afresh."""
-    goal = replace(ut.objective_for(FREE, "bench-energy", horizon=3.0), terminal_radius=0.3)
-    swinging = replace(cascade, mechanism=FREE, objective=goal, cold=ut.Budget(512), period=0.5)
     watch = Watch(swinging.optimiser)
     swinging = replace(swinging, planner=watch)
     run = swinging.simulate(CRANE.state(theta_dot=1.0), target={"x": 0.0}, duration=5.0)
@@ -125,6 +130,7 @@ def test_a_set_point_is_0_seen_from_elsewhere() -> None:
     assert {update.task for update in there.updates} == {0}
 
 
+@pytest.mark.slow  # two kernels of its own; a map about a target keeps within it, too
 def test_what_takes_over_after_a_jump_keeps_within_the_travel_about_a_target_too() -> None:
     """It is what a cart with its rail moved by as much has at x = 0: 95 % of ±1.5 m less 1.2 m."""
     here = ut.mechanisms.cart_pendulum()
@@ -165,10 +171,11 @@ def test_what_takes_over_after_a_jump_is_chosen_by_its_size() -> None:
 
 
 def test_what_takes_over_after_a_jump_is_chosen_anew_for_another_target(
-    cascade: ut.Cascade,
+    swinging: ut.Cascade,
 ) -> None:
     """It stayed what had been chosen on the way to the first target."""
-    stale, x = ut.Plan.of(cascade.optimiser.anchor), CRANE.state(theta=0.05)
+    cascade, x = swinging, CRANE.state(theta=0.05)
+    stale = ut.Plan.of(cascade.optimiser.anchor)
     memory = replace(CascadeState(stale), after_jump=((math.inf, stale),))
     there = ReferenceMotion.at_rest(np.array([0.5, 0.0]))
     answer = respond(cascade, Request(0.0, x, 0.0, memory, target=there))
@@ -274,7 +281,7 @@ def test_a_refusal_tells_what_the_plan_in_use_costs_along_the_reference(
 ) -> None:
     """Not what the gate says of it about the target at rest."""
     cascade = ut.Cascade(
-        rig, ut.objective_for(rig, "effort"), belief="exact",
+        rig, ut.MinimumTime(), belief="exact",
         gate=lambda *_: Admission(False, "no", 1.0),
     )  # fmt: skip
     target = ut.Reference.sine(0.5, theta=0.3).legs(rig, 4.0)[0][1]
@@ -302,6 +309,7 @@ def test_the_travel_is_a_constraint_about_a_target_too() -> None:
     assert "1.425 m" in travel.name
 
 
+@pytest.mark.slow  # a kernel of its own
 def test_about_a_target_plausible_plants_have_their_errors_too() -> None:
     """Small ones of state and surface, which a belief adds: about x = 0 nothing is otherwise."""
     cart = ut.mechanisms.cart_pendulum()
@@ -329,7 +337,7 @@ def test_what_is_predicted_in_one_go_is_predicted_in_two(
     rig: ut.Mechanism, quick: ut.Surface, target: ut.Reference | None
 ) -> None:
     """Flows compose, whenever they begin; beside a target that moves, too."""
-    cascade = ut.Cascade(rig, ut.objective_for(rig, "effort"), belief="exact")
+    cascade = ut.Cascade(rig, ut.MinimumTime(), belief="exact")
     motion = None if target is None else target.legs(rig, 4.0)[0][1]
     state, error = CascadeState(ut.Plan.of(quick), target=motion), rig.state(phi=0.2)
     halfway = cascade.predicted_error(state, error, 1.0, 1.2)

@@ -26,6 +26,7 @@ from typer.main import get_command
 
 import undertow as ut
 from runs import run
+from support import rest_slow
 from undertow.base import ArtefactError, InvalidInputError, table, write_file
 from undertow.cli import _ORDER, _place, app, main, terminal
 from undertow.cli.parsing import (
@@ -443,6 +444,7 @@ def test_earlier_results_are_kept_and_said_where(tmp_path: Path) -> None:
     assert (tmp_path / "earlier-2" / "motion.csv").exists()
 
 
+@pytest.mark.slow  # as test_words and the quick start of the README do
 def test_simulate_with_no_further_choice_runs_the_cascade() -> None:
     """A name and a start are enough: it designs, optimises and arrives."""
     code, out, _ = run(
@@ -467,7 +469,7 @@ ARM = """<robot name="arm">
 </robot>"""
 
 
-@pytest.mark.parametrize("control", ["designed", "cascade"])
+@pytest.mark.parametrize("control", rest_slow(["designed", "cascade"], "designed"))  # its kernel
 def test_a_model_file_with_dry_friction_gets_the_layer_that_it_asks_for(
     tmp_path: Path, control: str
 ) -> None:

@@ -954,6 +954,7 @@ def test_a_controller_asks_for_no_more_than_it_believes_the_motor_can_give(
     assert batch.time[0] == pytest.approx(alone.time, rel=1e-4)
 
 
+@pytest.mark.slow  # a kernel of its own
 def test_along_a_reference_a_controller_keeps_to_its_belief_s_limit(
     rig: ut.Mechanism, quick: ut.Surface
 ) -> None:

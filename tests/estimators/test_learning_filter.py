@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import pytest
 
@@ -194,6 +196,7 @@ def test_senseless_beliefs_are_refused(arm: Mechanism) -> None:
         KalmanFilter(arm, belief=Belief.usual(arm), parameter_drift=-1.0)
 
 
+@lru_cache(maxsize=4)
 def _knocked(
     arm: Mechanism, knock: float, bad: int = -1
 ) -> tuple[KalmanFilter, FloatArray, FloatArray, FloatArray]:

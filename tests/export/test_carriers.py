@@ -216,11 +216,12 @@ def test_the_ros2_package_fits_together() -> None:
     assert all(f"    {parameter}: " in settings for parameter in declared)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "coordinates", "channel", "parameters", "prefix"),
     [
         ('2 "y" <&> \\', ("y", "float"), "return", "for while struct", "ut"),
-        pytest.param("Über/pendel", ("θ", "φ"), "main", "α EOF NAN", "foo", marks=pytest.mark.slow),
+        ("Über/pendel", ("θ", "φ"), "main", "α EOF NAN", "foo"),
     ],
 )
 def test_names_of_a_user_stay_clear_of_all_of_them(

@@ -706,7 +706,7 @@ def chain(count: int, axes: tuple[str, ...] = ("0 1 0",), tilt: str = "0 0 0") -
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        (chain(12), "12 moving joints.*at most 8000"),
+        pytest.param(chain(12), "12 moving joints.*at most 8000", marks=pytest.mark.slow),
         (chain(12, ("1 0 0", "0 1 0", "0 0 1"), "0.3 0.2 0.1"), "12 moving joints.*at most 8000"),
         (chain(17), "moving joints of 'bad'.*got 17.*at most 16"),
         (robot('<link name="base"/>', *(link(f"l_{i}") for i in range(300)), *(

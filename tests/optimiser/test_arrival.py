@@ -110,7 +110,7 @@ SEEDS = range(1), pytest.param(range(1, 14), marks=pytest.mark.slow)
 
 
 @pytest.mark.parametrize("seeds", SEEDS)
-@pytest.mark.parametrize("reaching", [False, True])
+@pytest.mark.parametrize("reaching", rest_slow([False, True], False))
 @pytest.mark.parametrize("name", rest_slow(["rotary_pendulum", "cart_pendulum"], "rotary_pendulum"))
 def test_no_first_answer_promises_an_arrival_that_only_its_own_steps_see(
     name: str, reaching: bool, seeds: range

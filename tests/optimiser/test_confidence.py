@@ -107,6 +107,6 @@ def test_the_same_search_says_the_same() -> None:
 def test_where_nothing_is_found_nothing_is_said() -> None:
     rig = ut.mechanisms.rotary_pendulum(d_e=0.025)
     optimiser = ut.Cascade(rig, ut.MinimumTime(), belief="exact").optimiser
-    answer = optimiser.propose(rig.state(phi=ut.deg(80)))
+    answer = optimiser.propose(rig.state(phi=ut.deg(80)), budget=ut.Budget(600))
     assert answer.status == "infeasible"
     assert answer.confidence is None

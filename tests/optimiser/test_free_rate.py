@@ -8,6 +8,7 @@ import sympy as sp
 from scipy.linalg import solve_continuous_are
 
 import undertow as ut
+from support import rest_slow
 from undertow.base import InvalidInputError
 from undertow.cascade.reserve import stiffer
 from undertow.cascade.robustness import sticking_distance
@@ -109,10 +110,13 @@ def test_a_start_of_the_acrobot_costs_what_the_best_of_all_inputs_does() -> None
     assert ut.Cascade(acrobot).simulate().cost < 1.01 * least
 
 
-def test_a_cost_of_one_s_own_frees_rates_where_it_weighs_every_coordinate() -> None:
+@pytest.mark.parametrize(
+    "name", rest_slow(["overhead_crane", "rotary_pendulum"], "rotary_pendulum")
+)
+def test_a_cost_of_one_s_own_frees_rates_where_it_weighs_every_coordinate(name: str) -> None:
     """A hundredth of the full input's cost for each unit of error, on cranes as on pendulums."""
-    crane = ut.mechanisms.overhead_crane()
-    limit = crane.input_limits[0]
+    mechanism = ut.mechanisms.LIBRARY[name]()
+    limit = mechanism.input_limits[0]
 
     def weighing(place: float, angle: float) -> ut.Objective:
         def stage(v: Names) -> sp.Expr:
@@ -122,7 +126,7 @@ def test_a_cost_of_one_s_own_frees_rates_where_it_weighs_every_coordinate() -> N
         return ut.Objective("own", stage)
 
     for place, angle, rate in ((0.01, 0.01, True), (0.02, 0.005, False), (0.0, 1.0, False)):
-        cascade = ut.Cascade(crane, weighing(place, angle))
+        cascade = ut.Cascade(mechanism, weighing(place, angle))
         assert cascade.optimiser.freedom.rate is rate
 
 

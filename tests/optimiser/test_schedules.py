@@ -90,9 +90,10 @@ def test_the_pieces_of_a_motion_join() -> None:
     assert (found.x >= low - 1e-9).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
-    ["rotary_pendulum", pytest.param("pendubot", marks=pytest.mark.slow)],  # kernels of its own
+    ["rotary_pendulum", "pendubot"],
 )
 def test_a_schedule_is_near_the_earliest_arrival(name: str) -> None:
     """A single surface with its reaching law takes 10 to 50 % longer."""

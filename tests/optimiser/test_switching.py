@@ -32,6 +32,7 @@ def earliest() -> tuple[Optimisation, OpenLoopMotion]:
     return task, motion
 
 
+@pytest.mark.slow  # kernels of its own
 def test_the_earliest_motion_has_three_switches(
     earliest: tuple[Optimisation, OpenLoopMotion],
 ) -> None:
@@ -45,6 +46,7 @@ def test_the_earliest_motion_has_three_switches(
         assert (np.abs(motion.x - state) / span).max(axis=1).min() < 0.15
 
 
+@pytest.mark.slow
 def test_the_law_asks_for_no_input_where_the_motion_switches(
     earliest: tuple[Optimisation, OpenLoopMotion],
 ) -> None:
@@ -71,6 +73,7 @@ def test_the_law_asks_for_no_input_where_the_motion_switches(
     assert sum(small) >= 3
 
 
+@pytest.mark.slow
 def test_a_search_around_the_fits_is_not_begun_that_cannot_be_ended(
     earliest: tuple[Optimisation, OpenLoopMotion],
 ) -> None:

@@ -16,6 +16,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import undertow as ut
+from support import rest_slow
 from undertow.base import InvalidInputError
 from undertow.law import ReachingLaw, SlidingModeLaw
 from undertow.models import FloatArray
@@ -233,7 +234,8 @@ def test_a_set_across_an_edge_of_the_layer_falls_together() -> None:
 # -- the terminal set -----------------------------------------------------------------------------
 
 
-def test_the_derivative_of_the_map_holds_difference_quotients() -> None:
+@pytest.mark.parametrize("count", rest_slow([3, 10], 3))
+def test_the_derivative_of_the_map_holds_difference_quotients(count: int) -> None:
     """Of all states and of the mass, over the box of the set, against SciPy."""
     loop = HeldLoop(MODEL, NUMBERS, PERIOD, within("1/50", "m"))
     loop.take(END.W, END.radius)
@@ -254,7 +256,7 @@ def test_the_derivative_of_the_map_holds_difference_quotients() -> None:
         return loop.coordinates(between(after, after))[:, 0].real
 
     rng, h = np.random.default_rng(3), np.array([1e-6, 1e-6, 1e-6, 1e-6, 1e-5])
-    for _ in range(10):
+    for _ in range(count):
         ball = rng.normal(size=4)
         z = V.real @ (0.9 * loop.radius.real * ball / np.linalg.norm(ball))
         point = np.r_[z, rng.uniform(mass[0], mass[1])]
@@ -300,6 +302,7 @@ def test_the_terminal_set_shrinks_from_sample_to_sample() -> None:
         assert words in why
 
 
+@pytest.mark.slow
 def test_one_terminal_set_is_found_for_every_damping_within_30_percent() -> None:
     """That of the law's own plant, however small, is none; in simulation the one found is one."""
     loop = HeldLoop(MODEL, NUMBERS, PERIOD, within("3/10", "d_e"))

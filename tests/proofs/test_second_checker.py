@@ -537,7 +537,7 @@ def test_mutants_are_decided_alike_and_nothing_false_is_proved(
 
 
 @needs_compiler
-@pytest.mark.parametrize(("seed", "each"), rest_slow([(1, 4), (2, 60)], (1, 4)))
+@pytest.mark.parametrize(("seed", "each"), rest_slow([(1, 2), (2, 60)], (1, 2)))
 def test_what_is_false_by_a_hair_is_not_proved(
     program: Path, tmp_path: Path, seed: int, each: int
 ) -> None:
@@ -657,7 +657,7 @@ def evaluated(program: Path, cases: list[Document], file: Path) -> list[list[str
 
 
 @needs_compiler
-@pytest.mark.parametrize("count", [400, pytest.param(2000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", rest_slow([150, 2000], 150))
 def test_expressions_are_enclosed_with_their_derivatives(
     program: Path, tmp_path: Path, count: int
 ) -> None:
@@ -773,6 +773,7 @@ def test_mechanisms_are_decided_alike(
     assert min(decided.values()) >= 2 * len(names), decided
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_regions_on_the_surface_are_decided_and_larger_ones_refused(
     program: Path, tmp_path: Path

@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 
 import undertow as ut
 from runs import RECIPE
-from support import rest_slow
 from undertow.base import InvalidInputError
 from undertow.cascade import Admission, CascadeState
 from undertow.cascade.swing_up import Gains
@@ -193,6 +192,14 @@ def test_after_a_knock_a_plan_in_reserve_takes_over_and_a_decision_comes_early()
     assert answers[1][0] < jump + 0.025  # the decision, whatever the gate makes of it
     assert abs(rig.truth[1]) < 0.1
     assert controller.mode in (Mode.CATCH, Mode.BALANCE)
+
+
+def test_what_a_recipe_starts_with_depends_on_it_alone() -> None:
+    """To the bit, so that the tests may search once for each recipe: ``first_once`` in conftest."""
+    made = RECIPE.first()
+    again = vars(Recipe.first)["__wrapped__"](replace(RECIPE))
+    assert replace(again, estimate=made.estimate) == made
+    assert str(again.estimate) == str(made.estimate)
 
 
 @pytest.mark.parametrize(("asked", "kept"), [(0.5, 0.5), (1.5, math.radians(60.0))])
@@ -483,7 +490,8 @@ def test_an_answer_for_another_state_is_refused_at_its_time(controller: Controll
 # -- other mechanisms ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("period", "least"), rest_slow([(0.004, 10), (0.01, 3)], (0.01, 3)))
+@pytest.mark.slow
+@pytest.mark.parametrize(("period", "least"), [(0.004, 10), (0.01, 3)])
 def test_a_slow_loop_is_optimised_as_a_quick_one_is(period: float, least: int) -> None:
     """At 250 and 100 Hz plans are admitted, and the output does not chatter between samples."""
     with session(replace(RECIPE, period=period), simulated=True) as runtime:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import time
 from dataclasses import replace
@@ -32,8 +33,25 @@ from undertow.runtime import (
     replay,
     respond,
 )
-from undertow.runtime.clock import Histogram
+from undertow.runtime.clock import Histogram, WallClock
+from undertow.runtime.loop import _quiet_interpreter
 from undertow.runtime.slow_loop import Answer, Request
+
+
+@pytest.mark.parametrize(("frozen", "released"), [(0, 1), (1000, 0)])
+def test_what_was_frozen_before_a_run_stays_so(
+    frozen: int, released: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each collection after a run went through all that its caller had kept out of them."""
+    said: list[str] = []
+    for name in ("collect", "freeze", "unfreeze"):
+        monkeypatch.setattr(gc, name, lambda *_, name=name: said.append(name))
+    monkeypatch.setattr(gc, "get_freeze_count", lambda: frozen)
+    with _quiet_interpreter(WallClock()):
+        assert not gc.isenabled()
+    assert gc.isenabled()
+    assert said == ["collect", "freeze", *["unfreeze"] * released]
+
 
 # -- deadlines, by a clock that is told to jump ---------------------------------------------------
 

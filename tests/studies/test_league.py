@@ -324,6 +324,7 @@ def test_a_referee_names_what_was_wrong() -> None:
         Refereed(Late(), np.zeros(4), 1)(0.0, np.zeros(4))
 
 
+@pytest.mark.slow
 def test_our_entrants_are_made_for_the_estimator_that_they_hear() -> None:
     """Coarse encoders leave more of the input to noise: other gains, another gate."""
     rig = LIBRARY[RIG]()

@@ -561,14 +561,15 @@ class Runtime:
 def _quiet_interpreter(clock: Clock) -> Iterator[tuple[str, ...]]:
     """Keep the interpreter from pausing the loop: no collections but those that the loop makes.
 
-    Old objects are frozen; other threads yield quickly, and wait while the loop works.
+    Old objects are frozen, until the end where nothing was frozen before; other threads yield
+    quickly, and wait while the loop works.
     The fast loop also asks for a real-time priority and for its memory to stay where it is;
     yields what the system said to that.
     """
     if clock.simulated:
         yield ()
         return
-    interval, collecting = sys.getswitchinterval(), gc.isenabled()
+    interval, collecting, frozen = sys.getswitchinterval(), gc.isenabled(), gc.get_freeze_count()
     sys.setswitchinterval(YIELD)  # the clock goes on with it
     gc.collect()
     gc.freeze()
@@ -577,7 +578,8 @@ def _quiet_interpreter(clock: Clock) -> Iterator[tuple[str, ...]]:
         with real_time_priority() as priority, locked_memory() as memory:
             yield priority, memory
     finally:
-        gc.unfreeze()
+        if not frozen:
+            gc.unfreeze()
         if collecting:
             gc.enable()
         sys.setswitchinterval(interval)
