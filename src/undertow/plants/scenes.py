@@ -38,7 +38,10 @@ def mujoco_scene(mechanism: Mechanism) -> Scene:
 
     Raises InvalidInputError for a mechanism that is not of the library, whatever it is called.
     """
-    own = "Bring an MJCF file of your own: MuJoCoRig(scene=FILE), undertow run --rig FILE.xml"
+    own = (
+        "Bring an MJCF file of your own: undertow.models.importers.from_mjcf(FILE), and "
+        "MuJoCoRig(scene=FILE) or undertow run --rig FILE.xml"
+    )
     one_of("MuJoCo scene", mechanism.name, _SCENES, own)
     known = LIBRARY[mechanism.name]()
     parts = ("q", "parameter_symbols", "mass_matrix", "force", "input_matrix")
