@@ -501,6 +501,15 @@ def test_urdfs_that_mean_nothing_are_refused(old: str, new: str, match: str) -> 
         modelling.from_urdf(changed(CART_URDF, old, new))
 
 
+def test_a_transmission_to_a_joint_that_is_not_there_is_no_slip_of_who_reads() -> None:
+    """Of part of a robot: the file is refused for it, unless the driven joints are named."""
+    text = changed(CART_URDF, '<joint name="x"/>', '<joint name="shoulder"/>')
+    with pytest.raises(ModelError, match=r"transmission.*'shoulder'.*one of phi, x") as refusal:
+        modelling.from_urdf(text)
+    assert "FILE.urdf:JOINT" in refusal.value.remedy
+    assert modelling.from_urdf(text, actuated=["x"]).m == 1
+
+
 def test_a_massless_link_of_a_file_is_refused() -> None:
     """Claim: a moving link without mass is refused with link and joint, in both formats."""
     start, end = (

@@ -95,6 +95,8 @@ def from_urdf(
     with computable("URDF"):
         robot = _frozen(parse_xml(source, "robot"), names_of(frozen, "frozen"))
         tree, transmitted = _read(robot, gravity)
+        if actuated is None:
+            _check_transmitted(tree, transmitted)
         driven = actuated if actuated is not None else transmitted or _driven(tree) or None
         if isinstance(equilibrium, str):
             check_held(tree, driven or ())
@@ -116,6 +118,19 @@ def from_urdf(
         if isinstance(equilibrium, str):
             return at_equilibrium(mechanism, equilibrium)
         return mechanism
+
+
+def _check_transmitted(tree: Tree, transmitted: Sequence[str]) -> None:
+    """Refuse transmissions to joints that are not there: of part of a robot, or misspelt."""
+    moving = {joint.name for joint in tree.moving}
+    for name in transmitted:
+        if name not in moving:
+            raise ModelError(
+                f"transmission of URDF '{tree.name}'",
+                value=f"to '{name}', which is no joint of it",
+                limit=f"to one of {', '.join(sorted(moving))}",
+                remedy="Mend the file, or name what is driven: actuated=[...], FILE.urdf:JOINT",
+            )
 
 
 def _driven(tree: Tree) -> list[str]:
