@@ -52,7 +52,7 @@ def main() -> int:
         found, seconds = [], []
         for rate in (False, True):
             cascade = ut.Cascade(mechanism, freedom=ut.DecisionVariables(rate=rate))
-            cascade.simulate(plant=None)  # compile, warm up
+            cost(cascade)  # compile, warm up
             began = now()
             found.append([cost(cascade)])
             seconds.append(now() - began)

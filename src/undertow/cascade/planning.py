@@ -55,11 +55,6 @@ class Found(NamedTuple):
     cost: float
     proposal: Proposal
 
-    @property
-    def keeps_promise(self) -> bool:
-        """Whether the plan does what the search said of it."""
-        return math.isfinite(self.cost) and self.cost <= AGREES * self.proposal.cost
-
 
 class Planning:
     """The searches of a cascade.
@@ -114,11 +109,12 @@ class Planning:
         single = predictions.single(known)
         last = [] if single is None else [Search(single)]
         tries: list[Found] = []
+        kept = False  # whether the last plan does what the search said of it
         for loop, fixed, repairs in [*self._searches(known), *last]:
             found = tries[-1].proposal if tries else None
             if loop is single and found is not None and found.plan is not None:
                 break
-            if fixed is not None and not here.price_of_time > 0 and tries[-1].keeps_promise:
+            if fixed is not None and not here.price_of_time > 0 and kept:
                 continue  # smaller steps find nothing else
             about, planner = predictions.about(loop, target, t), planners.of(loop, target, t)
             if fixed is not None:
@@ -139,10 +135,12 @@ class Planning:
                 )
             plan = proposal.plan
             if plan is None:
+                kept = False
                 tries.append(Found(3, math.inf, proposal))
                 continue
             cost = float(about.batch(x, plan, duration=horizon, precise=True).score(horizon)[0])
             cost = cost if cost < INADMISSIBLE else math.inf
+            kept = math.isfinite(cost) and cost <= AGREES * proposal.cost
             begun = CascadeState(plan, number, cost, cost, t, as_numbers(x), known, target)
             good = math.isfinite(cost) and math.isinf(judge.breaks(begun, [plan], x, horizon)[0][0])
             if loop is not whole:  # every plausible plant lives to see the next decision
@@ -151,7 +149,7 @@ class Planning:
                 else:
                     good &= judge.reserve.recovers(here, x, horizon, plan)
             if loop.ensemble is None and planners.own is None:
-                good &= cost <= AGREES * proposal.cost
+                good &= kept
             tries.append(Found(0 if good else 1 if loop is whole else 2, cost, proposal))
             if good:
                 break

@@ -109,8 +109,9 @@ def motion_report(
 ) -> RenderableType:
     """Return a simulated motion for the terminal.
 
-    ``surface`` is the (first) one, ``run`` the record of ``cascade`` where one was run, ``target``
-    where to, and in ``words``, where that is not x = 0; ``reaching`` how surfaces are reached.
+    ``surface`` is that of a motion without a ``run``, which is the record of ``cascade``;
+    ``target`` where to, and in ``words``, where that is not x = 0; ``reaching`` how surfaces are
+    reached.
     """
     rows = _head(mechanism, objective, start, None if cascade is None else cascade.gate, reaching)
     if target is not None:
@@ -120,8 +121,8 @@ def motion_report(
     else:
         admitted = sum(update.admission.accepted for update in run.updates)
         rows += [
-            ("first optimum", _plan_words(run.updates[0].plan)),
-            ("last surface", _plan_words(run.updates[-1].plan)),
+            ("first optimum", _plan_words(run.plans[0])),
+            ("last surface", _plan_words(run.plans[-1])),
             ("optimisations", f"{len(run.updates)}, {admitted} admitted"),
         ]
         if any(verdict is not None for verdict in run.verdicts):
