@@ -266,7 +266,7 @@ def test_a_full_disk_is_told_and_leaves_no_half_file(
     assert not list(folder.iterdir())
 
 
-COMPILED = """from undertow.symbolic.machine import compiled
+COMPILED = """from undertow.symbolic.compiler import compiled
 @compiled()
 def half(x):
     return 0.5 * x

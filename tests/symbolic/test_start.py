@@ -278,7 +278,7 @@ def _assigned_arrays(source: str) -> Iterator[str]:
 
 
 def _is_body(text: object) -> bool:
-    return isinstance(text, str) and text.startswith("\n@numba.njit")
+    return isinstance(text, str) and text.startswith(("\n@compiled", "\n@brief"))
 
 
 def test_compiled_code_copies_arrays_by_their_entries() -> None:

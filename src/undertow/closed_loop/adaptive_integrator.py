@@ -400,8 +400,8 @@ def look_source(program: LoopGraph, *, header: str) -> str:
         "look": [*loads(flow_needs), *moved] if program.sampled else looked,
     }
     return f"{docstring(header)}{PREAMBLE}{PRIMITIVES}" + "".join(
-        f"\n\n@numba.njit({_LOOK}, cache=True, nogil=True, error_model='numpy', "
-        "pipeline_class=Straight, fastmath={'contract', 'nsz', 'arcp'})\n"
+        f"\n\n@compiled({_LOOK}, no_cfunc_wrapper=False, pipeline_class=Straight, "
+        " fastmath={'contract', 'nsz', 'arcp'})\n"
         f"def {name}(t, x, lane, plant, belief, limits, u, seen, rates):\n"
         f"{textwrap.indent(chr(10).join(lines), '    ')}\n"
         for name, lines in functions.items()

@@ -27,7 +27,7 @@ from undertow.models import TIME, FloatArray, error_dynamics
 from undertow.symbolic import Tape, function_source, scalar_module
 
 _BODY = f"""
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def along(
     x, reference, lanes, segments, belief, plant, limits, start, h, steps, hold, radius, escape,
     hard, prices, record,

@@ -434,10 +434,7 @@ import numba
 import numpy as np
 {PRIMITIVES}
 
-@numba.njit(
-    cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True,
-    pipeline_class=Straight, fastmath={{"contract", "nsz", "arcp"}},
-)
+@compiled(pipeline_class=Straight, fastmath={{"contract", "nsz", "arcp"}})
 def rollout(
     from_lane, to_lane, x0, live, lanes, switch, plant, belief, limits, noise,
     start, h, steps, zoh_steps, terminal, escape, cap, seek, prices, calm_from, every, record, out,
@@ -497,10 +494,7 @@ def _etd_integrate(w: _Writer) -> str:
     """Return the function that ends rollouts in large steps, see :mod:`.exponential_integrator`."""
     return f"""
 
-@numba.njit(
-    cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True,
-    pipeline_class=Straight, fastmath={{"contract", "nsz", "arcp"}},
-)
+@compiled(pipeline_class=Straight, fastmath={{"contract", "nsz", "arcp"}})
 def etd_integrate(
     from_lane, to_lane, lanes, plant, belief, limits, until, terminal, escape, tail, counted,
     linear, value, powers, forced, reach, out,

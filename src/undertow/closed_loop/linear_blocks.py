@@ -58,9 +58,8 @@ def _source(N: int) -> str:
 
 import numba
 {PRIMITIVES}
-inner = numba.njit(
-    cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True,
-    pipeline_class=Straight, fastmath={{"contract", "nsz", "arcp"}},
+inner = compiled(
+    no_cpython_wrapper=True, pipeline_class=Straight, fastmath={{"contract", "nsz", "arcp"}}
 )
 
 
@@ -78,9 +77,7 @@ def _turned(a, b, add, o):
 {_indented(turned)}
 
 
-@numba.njit(
-    cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True, pipeline_class=Straight,
-)
+@compiled(pipeline_class=Straight)
 def double(A, Q, P, stable, powers, forced):
     half = {N // 2}
     zero, one, scaled = memory({area}), memory({area}), memory({area})

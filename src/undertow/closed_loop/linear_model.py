@@ -252,7 +252,7 @@ def _close(  # type: ignore[no-untyped-def]
     for lane in range(lanes.shape[0]):
         p = lanes[lane, lanes.shape[1] - 1]
         for i in range(m):
-            k = (p[eta + i] if gains.size == 0 else gains[lane, i]) / p[layer + i]
+            rate = (p[eta + i] if gains.size == 0 else gains[lane, i]) / p[layer + i]
             for j in range(m):
                 value = p[i * m + j]
                 for f in range(free):
@@ -264,11 +264,11 @@ def _close(  # type: ignore[no-untyped-def]
                     value += p[alpha_u + i * free + f] * Y[f, j]
                 drive[i, j] = -value
             for j in range(m):
-                drive[i, j] -= k * p[lambda_a + i * m + j]
-                drive[i, n + j] -= k * p[i * m + j] + p[lambda_a + i * m + j]
+                drive[i, j] -= rate * p[lambda_a + i * m + j]
+                drive[i, n + j] -= rate * p[i * m + j] + p[lambda_a + i * m + j]
             for f in range(free):
-                drive[i, m + f] -= k * p[lambda_u + i * free + f]
-                drive[i, n + m + f] -= k * p[alpha_u + i * free + f] + p[lambda_u + i * free + f]
+                drive[i, m + f] -= rate * p[lambda_u + i * free + f]
+                drive[i, n + m + f] -= rate * p[alpha_u + i * free + f] + p[lambda_u + i * free + f]
         _solve(gamma, drive)
         for j in range(N):
             for i in range(m):

@@ -48,7 +48,7 @@ from undertow.models import (
 from undertow.plants import Measurement
 from undertow.plants.interface import copy_numbers
 from undertow.plants.stepping import compiled_module
-from undertow.symbolic import BRIEF, COMPILED, Workspace, numba, unpacked
+from undertow.symbolic import BRIEF, COMPILED, Workspace, brief, unpacked
 
 #: Parameters are learnt while some acceleration is larger than this part of what the full inputs do
 #: to it at the target, and than what the estimated disturbance does besides: what the model leaves
@@ -77,7 +77,7 @@ SETTLES = 0.02
 KNOCK = 0.005
 
 
-@numba.njit(cache=True, error_model="numpy")
+@brief()
 def predict_covariance(
     F: FloatArray, P: FloatArray, A: FloatArray, noise: FloatArray, h: float, moving: int
 ) -> None:
@@ -103,7 +103,7 @@ def predict_covariance(
             P[i, i] += h * noise[i]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@brief()
 def measurement_update(
     x: FloatArray, P: FloatArray, q: FloatArray, variance: FloatArray, column: FloatArray,
     learnt: int, share: FloatArray,
@@ -129,7 +129,7 @@ def measurement_update(
                 P[k, j] -= column[k] * column[j] / spread * part
 
 
-@numba.njit(cache=True, error_model="numpy")
+@brief()
 def repeated(count: float, h: float, speed: float, spread: float, noise: float) -> float:
     """Return how many readings in a row have the same error of rounding to a ``count``.
 
@@ -140,7 +140,7 @@ def repeated(count: float, h: float, speed: float, spread: float, noise: float) 
     return max(1.0, count / moves) if moves > 0.0 else 1.0
 
 
-@numba.njit(cache=True, error_model="numpy")
+@brief()
 def readings_after_jump(
     x: FloatArray, P: FloatArray, q: FloatArray, variance: FloatArray, h: float,
     knock: FloatArray, odd: FloatArray, taken: FloatArray,

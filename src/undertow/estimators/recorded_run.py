@@ -18,7 +18,7 @@ from undertow.base import InvalidInputError, between, floats
 from undertow.estimators.interface import Estimator
 from undertow.models import FloatArray
 from undertow.plants import Measurement, Rig, control_loop
-from undertow.symbolic import numba
+from undertow.symbolic import brief
 
 #: What steers: (t, x̂) to the inputs, (m,).
 StateFeedback = Callable[[float, FloatArray], FloatArray]
@@ -88,7 +88,7 @@ def run_recorded(
 SHARE = 0.5
 
 
-@numba.njit(cache=True, error_model="numpy")
+@brief()
 def subtract_disturbance(
     u: FloatArray, disturbance: FloatArray, limits: FloatArray, out: FloatArray
 ) -> None:

@@ -111,10 +111,7 @@ import numba
 import numpy as np
 {PRIMITIVES}
 
-@numba.njit(
-    cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True,
-    pipeline_class=Straight, fastmath={{"contract", "nsz", "arcp"}},
-)
+@compiled(pipeline_class=Straight, fastmath={{"contract", "nsz", "arcp"}})
 def advance(x, u, t, cost, margin, plant, h, steps):
 {_lines(constants, 1)}
     weights, reaches, places = {table}

@@ -58,7 +58,7 @@ from undertow.models import (
     normal_name,
     number_of,
 )
-from undertow.symbolic import numba
+from undertow.symbolic import brief
 
 #: Damping of swinging modes in the reference of the unactuated coordinates, of critical.
 SWING_DAMPING = 0.5
@@ -136,7 +136,7 @@ class ReferenceMotion:
         return error_dynamics(mechanism, self.rows(t)[0])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@brief()
 def reference_row(
     t: float, times: FloatArray, q: FloatArray, v: FloatArray, a: FloatArray, row: FloatArray
 ) -> None:

@@ -21,10 +21,10 @@ from typing import Any
 import sympy as sp
 
 from undertow.models import TIME, FloatArray, Mechanism
-from undertow.symbolic import COMPILED, Tape, function_source, numba, scalar_module, unpacked
+from undertow.symbolic import COMPILED, Tape, compiled, function_source, scalar_module, unpacked
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def transmit(
     j: int,
     h: float,
@@ -67,7 +67,7 @@ def transmit(
                 applied[i] = 0.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def backlash_separation(
     h: float,
     x: FloatArray,
@@ -103,7 +103,7 @@ def backlash_separation(
             mobility[i * n + i] *= scale
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def backlash_impact(
     h: float,
     x: FloatArray,
@@ -135,7 +135,7 @@ def backlash_impact(
                     drive[2, i] = 0.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def dry_friction(
     h: float,
     x: FloatArray,
@@ -175,7 +175,7 @@ def dry_friction(
             break
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def end_stops(x: FloatArray, stops: FloatArray, mobility: FloatArray) -> int:
     """Hold the coordinates within their ranges, without a rebound; how many ran into a stop."""
     n, hits = x.shape[0] // 2, 0
@@ -193,7 +193,7 @@ def end_stops(x: FloatArray, stops: FloatArray, mobility: FloatArray) -> int:
     return hits
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled()
 def measure(
     index: int,
     past: FloatArray,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from undertow.symbolic import numba
+from undertow.symbolic import brief
 
 
 class Mode(IntEnum):
@@ -70,7 +70,7 @@ _NO_COMMAND, _START, _STOP, _RESET, _END = map(int, Command)
 ) = map(int, Reason)  # fmt: skip
 
 
-@numba.njit(cache=True, error_model="numpy")
+@brief()
 def transition(
     mode: int,
     command: int,

@@ -12,7 +12,7 @@ import numpy as np
 
 from undertow.law import LawLayout, Plan, ReachingLaw
 from undertow.models import FloatArray, Mechanism, linear_numbers
-from undertow.symbolic import Workspace, numba
+from undertow.symbolic import Workspace, brief
 
 #: What the test knows and works on: M, F and D of the unactuated rows at the target, X = M_uu⁻¹
 #: M_auᵀ there, a surface, the matrix of its sliding dynamics, and room for the eliminations.
@@ -95,7 +95,7 @@ class PlanCheck:
         return bool(_judge(self._m, self._layout.starts, *self._arrays))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@brief()
 def _solve(A: FloatArray, B: FloatArray, size: int, width: int) -> float:
     """Solve A X = B in place, (size, size) and (size, width); return det A, 0 where singular."""
     determinant = 1.0
@@ -126,7 +126,7 @@ def _solve(A: FloatArray, B: FloatArray, size: int, width: int) -> float:
     return determinant
 
 
-@numba.njit(cache=True, error_model="numpy")
+@brief()
 def _gamma(
     m: int, starts: tuple[int, ...], M: FloatArray, F: FloatArray, D: FloatArray, X: FloatArray,
     surface: FloatArray,
@@ -142,7 +142,7 @@ def _gamma(
     return _solve(left, right, m, 0)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@brief()
 def _judge(
     m: int, starts: tuple[int, ...], M: FloatArray, F: FloatArray, D: FloatArray, X: FloatArray,
     surface: FloatArray,
@@ -201,7 +201,7 @@ def _judge(
     return is_hurwitz(A, polynomials, routh)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@brief()
 def is_hurwitz(A: FloatArray, polynomials: FloatArray, routh: FloatArray) -> bool:
     """Whether all eigenvalues of A, (N, N), have negative real parts, by Routh and Hurwitz.
 
@@ -262,7 +262,7 @@ def is_hurwitz(A: FloatArray, polynomials: FloatArray, routh: FloatArray) -> boo
     return _routh(polynomials[size], routh)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@brief()
 def _balance(A: FloatArray) -> None:
     """Scale rows and columns by powers of two until they are of a size (Parlett, Reinsch)."""
     size = A.shape[0]
@@ -294,7 +294,7 @@ def _balance(A: FloatArray) -> None:
             return
 
 
-@numba.njit(cache=True, error_model="numpy")
+@brief()
 def _routh(polynomial: FloatArray, rows: FloatArray) -> bool:
     """Whether the first column of Routh's array is positive; ascending powers, the last is 1."""
     order = polynomial.shape[0] - 1

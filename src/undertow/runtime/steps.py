@@ -19,8 +19,8 @@ from undertow.symbolic import (
     BRIEF,
     Tape,
     Workspace,
+    brief,
     function_source,
-    numba,
     scalar_module,
     unpacked,
 )
@@ -142,7 +142,7 @@ def step_module(mechanism: Mechanism, switching: Switching) -> Any:
     return scalar_module("step", "Fast step", mechanism.name, depends, lambda: [_BODY], head)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@brief()
 def limit_output(wanted: FloatArray, u: FloatArray, limits: FloatArray, slew: FloatArray) -> None:
     """Bring u, (m,), towards ``wanted`` within limits and within ``slew`` of where it was.
 
@@ -154,7 +154,7 @@ def limit_output(wanted: FloatArray, u: FloatArray, limits: FloatArray, slew: Fl
         u[i] = max(-limits[i], min(limits[i], aim)) + 0.0  # no −0: a log does not keep its sign
 
 
-@numba.njit(cache=True, error_model="numpy")
+@brief()
 def relative_error(x: FloatArray, expected: FloatArray) -> float:
     """Return the largest |x_i − e_i| / (1 + |e_i|); infinite where that is no number."""
     worst = 0.0
@@ -165,7 +165,7 @@ def relative_error(x: FloatArray, expected: FloatArray) -> float:
     return worst
 
 
-@numba.njit(cache=True, error_model="numpy")
+@brief()
 def all_finite(numbers: FloatArray) -> bool:
     """Whether all numbers, (S, …), are finite, and so is their sum."""
     size = 0.0
@@ -174,7 +174,7 @@ def all_finite(numbers: FloatArray) -> bool:
     return size < math.inf
 
 
-@numba.njit(cache=True, error_model="numpy")
+@brief()
 def accept_estimate(
     estimate: FloatArray, turn: FloatArray, x: FloatArray, wrapped: FloatArray
 ) -> bool:

@@ -7,12 +7,13 @@ assignments with its linear algebra unrolled. The printers make code of it: :mod
 """
 
 from undertow.symbolic.c99 import C99Emitter, Real, literal
+from undertow.symbolic.compiler import Straight, brief, compiled
 from undertow.symbolic.expressions import parse_expression
 from undertow.symbolic.function import COMPILED, PREAMBLE, function_source, scalar_module
-from undertow.symbolic.machine import compiled, numba, processor
+from undertow.symbolic.machine import numba, processor
 from undertow.symbolic.names import distinct, docstring
 from undertow.symbolic.scalar import Emitter
-from undertow.symbolic.single_assignment import PRIMITIVES, Straight, single_assignment
+from undertow.symbolic.single_assignment import PRIMITIVES, single_assignment
 from undertow.symbolic.store import (
     content_key,
     generated,
@@ -36,6 +37,7 @@ __all__ = [
     "Straight",
     "Tape",
     "Workspace",
+    "brief",
     "compile_expressions",
     "compile_numpy",
     "compiled",

@@ -17,13 +17,16 @@ from undertow.symbolic.store import content_key, generated
 from undertow.symbolic.tape import Tape
 
 #: Head of a generated module.
-PREAMBLE = "import math\n\nimport numba\nimport numpy as np\n"
+PREAMBLE = (
+    "import math\n\nimport numba\nimport numpy as np\n"
+    "from undertow.symbolic.compiler import brief, compiled\n"
+)
 
 #: Decorator of every function that is compiled: no lock of the interpreter, no exceptions.  What
 #: another one calls is inlined there: else the process that compiles it calls it in its own
 #: library, later ones the copy that was stored with its caller, and the two round otherwise.  Every
 #: operation is rounded by itself: which ones a compiler would fuse depends on what went before.
-COMPILED = "@numba.njit(cache=True, nogil=True, error_model='numpy', forceinline=True)"
+COMPILED = "@compiled(forceinline=True)"
 
 
 def function_source(

@@ -14,9 +14,9 @@ Before numba loads what it keeps it imports all that it would need to compile, f
 second and 25 MB; machine code needs its runtime alone, and here gets no more.
 
 What numba builds while it compiles is there until the end: looking for garbage in it would take a
-tenth of the time.  So would functions for callers in C, which :data:`compiled` leaves out, and
-finding again and again what type a sum of two numbers has would take more.  All of this is for
-functions of this package alone; other people's are compiled as ever.
+tenth of the time.  So would functions for callers in C, which :data:`~.compiler.compiled` leaves
+out, and finding again and again what type a sum of two numbers has would take more.  All of this is
+for functions of this package alone; other people's are compiled as ever.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import gc
 import os
 import platform
 from contextlib import nullcontext, suppress
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,7 @@ from numba.core.types import functions as numba_functions
 
 from undertow.symbolic.private import is_private, private_folder
 
-__all__ = ["compiled", "numba", "processor"]
+__all__ = ["numba", "processor"]
 
 PACKAGE = Path(__file__).resolve().parent.parent
 
@@ -46,12 +46,6 @@ PACKAGE = Path(__file__).resolve().parent.parent
 caching: Any = numba_caching
 functions: Any = numba_functions
 event: Any = numba_event
-
-#: Decorator of the functions of this package that are compiled: no lock of the interpreter, no
-#: exceptions.
-compiled: Any = partial(
-    numba.njit, cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True
-)
 
 
 def _widen() -> None:

@@ -16,31 +16,18 @@ from typing import Any, TypeGuard, cast
 
 import numpy as np
 from llvmlite import ir
-from numba.core import compiler as numba_compiler
 
 from undertow.symbolic.machine import numba
 
 #: What a module imports whose loops were rewritten.
-PRIMITIVES = "from undertow.symbolic.single_assignment import Straight, memory, select\n"
+PRIMITIVES = (
+    "from undertow.symbolic.compiler import Straight, compiled\n"
+    "from undertow.symbolic.single_assignment import memory, select\n"
+)
 
 #: Modules without types.
-compiler: Any = numba_compiler
 llvm: Any = ir
 types: Any = numba.types
-
-
-class Straight(compiler.CompilerBase):  # type: ignore[misc]
-    """numba's compiler without what looks for closures and sums of whole arrays: there are none."""
-
-    LEFT_OUT = "InlineClosureLikes", "GenericRewrites", "NopythonRewrites"
-
-    def define_pipelines(self) -> list[Any]:
-        """Return the one list of its passes."""
-        usual = compiler.DefaultPassBuilder.define_nopython_pipeline(self.state).passes
-        passes = compiler.PassManager("straight")
-        passes.passes = [each for each in usual if each[0].__name__ not in self.LEFT_OUT]
-        passes.finalize()
-        return [passes]
 
 
 def select(condition: Any, yes: Any, no: Any) -> Any:

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-#: Decorator of generated functions that take about a microsecond.  They keep the interpreter's
-#: lock: to let go of it for so short a time is to hand it to another thread, and to wait.  Every
-#: operation is rounded by itself (see :data:`undertow.symbolic.function.COMPILED`).
-BRIEF = "@numba.njit(cache=True, error_model='numpy', forceinline=True)"
+#: Decorator of generated functions that take about a microsecond, see
+#: :data:`undertow.symbolic.compiler.brief`.  Every operation is rounded by itself (see
+#: :data:`undertow.symbolic.function.COMPILED`).
+BRIEF = "@brief(forceinline=True)"
 
 #: Name of an array to its dimensions, Python expressions: ``{"P": "size, size"}``.
 Layout = Mapping[str, str]
