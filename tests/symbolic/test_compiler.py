@@ -16,7 +16,7 @@ from undertow.symbolic.compiler import UNSUITED, Straight
 HEAD = """import math
 import numpy as np
 from undertow.symbolic.compiler import Straight, brief, compiled
-from undertow.symbolic.single_assignment import select
+from undertow.symbolic.primitives import select
 
 TABLE = np.array([[0.5, -1.25], [3.0, 0.1]])
 WHOLE = 3
@@ -124,6 +124,8 @@ class Program:
             lambda: [f"b[{self.place(3)}, {self.place(2)}] -= {self.real(1)}"],
             lambda: [f"n[{self.place(2)}] = ({self.whole()}) % 7"],
             lambda: [f"row = b[{self.place(3)}]", f"kept = row[{self.place(2)}]"],
+            lambda: [f"y = {self.real(1)}", f"a[{self.place(4)}] = y * y"],
+            lambda: [f"y = {self.real(0)}", f"if {self.truth(0)}:", "    y = 2.0", "kept -= y"],
         ]
         nested: list[Callable[[], list[str]]] = [
             lambda: self.block(f"if {self.truth(1)}:", loop=loop, other=True),

@@ -6,7 +6,8 @@ import ast
 
 import numpy as np
 
-from undertow.symbolic import PRIMITIVES, load_module, single_assignment
+from undertow.symbolic import PRIMITIVES, load_module
+from undertow.symbolic.single_assignment import single_assignment
 
 SOURCE = f"""import math
 import numba

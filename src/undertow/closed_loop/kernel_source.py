@@ -31,7 +31,7 @@ from undertow.closed_loop.work_array import (
     entrance,
     total,
 )
-from undertow.symbolic import PRIMITIVES, Emitter, distinct, docstring, single_assignment
+from undertow.symbolic import PRIMITIVES, Emitter, distinct, docstring
 
 #: Whether a lane may hand over is looked at in these intervals, s.
 WATCH = 0.032
@@ -487,7 +487,7 @@ def rollout(
         groups = min({GROUPS}, (to_lane - b) // {LANES})
 {_groups(w.collect(), 2)}
 {"" if program.sampled else _etd_integrate(w)}"""
-    return single_assignment(source)
+    return source
 
 
 def _etd_integrate(w: _Writer) -> str:

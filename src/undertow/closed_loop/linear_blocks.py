@@ -13,7 +13,7 @@ from functools import lru_cache
 from types import ModuleType
 
 from undertow.closed_loop.work_array import LANES
-from undertow.symbolic import PRIMITIVES, content_key, generated, single_assignment
+from undertow.symbolic import PRIMITIVES, content_key, generated
 
 #: Time of the first stored power e^{At}, s; level k stands for 2ᵏ units.
 UNIT = 0.005
@@ -168,7 +168,7 @@ def double(A, Q, P, stable, powers, forced):
                 for c in range({N}):
                     P[first + i, r, c] = X[(r * {N} + c) * {LANES} + i]
 '''
-    return single_assignment(source)
+    return source
 
 
 def _indented(lines: list[str]) -> str:

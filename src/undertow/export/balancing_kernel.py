@@ -23,7 +23,6 @@ from undertow.symbolic import (
     content_key,
     docstring,
     generated,
-    single_assignment,
 )
 
 #: Runge-Kutta's fourth-order step: weights of its stages, how far each goes on, and when it is.
@@ -129,7 +128,7 @@ def advance(x, u, t, cost, margin, plant, h, steps):
         into = steps * h
 {_loop(give, 2)}
 """
-    return single_assignment(source)
+    return source
 
 
 def _lines(lines: list[str], depth: int) -> str:

@@ -7,13 +7,12 @@ assignments with its linear algebra unrolled. The printers make code of it: :mod
 """
 
 from undertow.symbolic.c99 import C99Emitter, Real, literal
-from undertow.symbolic.compiler import Straight, brief, compiled
+from undertow.symbolic.compiler import PRIMITIVES, Straight, brief, compiled
 from undertow.symbolic.expressions import parse_expression
 from undertow.symbolic.function import COMPILED, PREAMBLE, function_source, scalar_module
 from undertow.symbolic.machine import numba, processor
 from undertow.symbolic.names import distinct, docstring
 from undertow.symbolic.scalar import Emitter
-from undertow.symbolic.single_assignment import PRIMITIVES, single_assignment
 from undertow.symbolic.store import (
     content_key,
     generated,
@@ -54,7 +53,6 @@ __all__ = [
     "recall",
     "remember",
     "scalar_module",
-    "single_assignment",
     "sources_digest",
     "unpacked",
 ]

@@ -24,9 +24,15 @@ from numba.core import errors as numba_errors
 
 from undertow.symbolic.lowering import SIGNS, Part
 from undertow.symbolic.machine import numba
-from undertow.symbolic.single_assignment import select
+from undertow.symbolic.primitives import select
 
-__all__ = ["Straight", "brief", "compiled"]
+__all__ = ["PRIMITIVES", "Straight", "brief", "compiled"]
+
+#: What a generated module imports beside :data:`.function.PREAMBLE`.
+PRIMITIVES = (
+    "from undertow.symbolic.compiler import Straight, compiled\n"
+    "from undertow.symbolic.primitives import memory, select\n"
+)
 
 #: Modules without types.
 compiler: Any = numba_compiler
@@ -131,13 +137,9 @@ class _Outliner:
         self.parts: dict[str, Part] = {}
         self.given = [each.arg for each in function.args.args]
         self.own = {*self.given, *_stored(function.body)}
-        self.rows = {
-            target.id
-            for node in ast.walk(function)
-            if isinstance(node, ast.Assign) and isinstance(node.value, ast.Subscript)
-            for target in node.targets
-            if isinstance(target, ast.Name)
-        } & set().union(*map(_used_whole, ast.walk(function)))
+        self.rows = set().union(*map(_rows, ast.walk(function))) & set().union(
+            *map(_used_whole, ast.walk(function))
+        )
         self.kept: set[str] = set()  # rows that parts do not assign
 
     def outline(self) -> None:
@@ -324,6 +326,22 @@ class _Outliner:
 
 #: Functions of NumPy that take numbers.
 _OF_NUMBERS = {"floor", "ceil", "sqrt", "abs", "exp", "sin", "cos"}
+
+
+def _rows(node: ast.AST) -> set[str]:
+    """Return the names that a line makes elements, or rows, of arrays."""
+    match node:
+        case ast.Assign([ast.Tuple(targets)], ast.Tuple(values)):
+            pairs = [*zip(targets, values, strict=False)]
+        case ast.Assign(targets, value):
+            pairs = [(target, value) for target in targets]
+        case _:
+            return set()
+    return {
+        target.id
+        for target, value in pairs
+        if isinstance(target, ast.Name) and isinstance(value, ast.Subscript)
+    }
 
 
 def _used_whole(node: ast.AST) -> set[str]:

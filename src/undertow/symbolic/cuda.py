@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal
 
 from undertow.base import ModelError
-from undertow.symbolic.single_assignment import is_straight
+from undertow.symbolic.single_assignment import is_straight, single_assignment
 
 Kind = Literal["bool", "long long", "double"]
 
@@ -89,7 +89,7 @@ class Translation:
         self.kinds, self.block = dict(kinds), block
         (function,) = (
             node
-            for node in ast.walk(ast.parse(source))
+            for node in ast.walk(ast.parse(single_assignment(source)))
             if isinstance(node, ast.FunctionDef) and node.name == name
         )
         self.shapes: list[tuple[str, int]] = []

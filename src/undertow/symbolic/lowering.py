@@ -22,7 +22,7 @@ from numba.core import typing as numba_typing
 from numba.np import arrayobj as numba_arrays
 
 from undertow.symbolic.machine import numba
-from undertow.symbolic.single_assignment import select
+from undertow.symbolic.primitives import select
 
 #: Modules without types.
 cgutils: Any = numba_cgutils
@@ -59,7 +59,7 @@ class Part:
         self.body, self.inputs, self.results, self.scope = body, inputs, results, scope
         self.returns = any(isinstance(node, ast.Return) for line in body for node in ast.walk(line))
         stored = {name.id for line in body for name in _in_order(line) if _is_stored(name)}
-        self.single = _in_one_list(body, inputs, results) | (set(inputs) - stored)
+        self.local = _local(body, (*inputs, *results)) | (set(inputs) - stored)
 
     def __call__(self) -> None:
         """Let numba take it for a function."""
@@ -85,39 +85,44 @@ class Part:
         target_context.insert_func_defn([(write, part, (types.VarArg(types.Any),))])
 
 
-def _in_one_list(
-    body: Sequence[ast.stmt], inputs: Sequence[str], results: Sequence[str]
-) -> set[str]:
-    """Return the names that only lines of one list hold, which begins by assigning them."""
-    places: dict[str, set[int]] = {name: {-1, -2} for name in (*inputs, *results)}
-    first: set[str] = set()
+def _local(body: Sequence[ast.stmt], shared: Sequence[str]) -> set[str]:
+    """Return the names that each list of lines that holds them begins by assigning.
+
+    None of these lists lies in another one. ``shared``: names that have a value before or behind
+    the lines.
+    """
+    stores: dict[str, dict[int, bool]] = {name: {0: False} for name in shared}
+    around: dict[int, set[int]] = {0: set()}
 
     def see(node: ast.AST, where: int) -> None:
         for name in _in_order(node):
-            if name.id not in places and isinstance(name.ctx, ast.Store):
-                first.add(name.id)
-            places.setdefault(name.id, set()).add(where)
+            stores.setdefault(name.id, {}).setdefault(where, _is_stored(name))
 
-    def walk(lines: Sequence[ast.stmt]) -> None:
+    def walk(lines: Sequence[ast.stmt], outside: set[int]) -> None:
+        here = id(lines)
+        around[here], inside = outside, outside | {here}
         for line in lines:
             match line:
                 case ast.For(target, each, inner):
-                    see(each, id(lines))
+                    see(each, here)
                     see(target, id(inner))
-                    walk(inner)
+                    walk(inner, inside)
                 case ast.While(test, inner):
-                    see(test, -1)
-                    see(test, -2)
-                    walk(inner)
+                    see(test, 0)
+                    walk(inner, inside)
                 case ast.If(test, yes, no):
-                    see(test, id(lines))
-                    walk(yes)
-                    walk(no)
+                    see(test, here)
+                    walk(yes, inside)
+                    walk(no, inside)
                 case _:
-                    see(line, id(lines))
+                    see(line, here)
 
-    walk(body)
-    return {name for name in first if len(places[name]) == 1}
+    walk(body, set())
+    return {
+        name
+        for name, lists in stores.items()
+        if all(first and not around[where] & lists.keys() for where, first in lists.items())
+    }
 
 
 def _is_stored(name: ast.Name) -> bool:
@@ -210,7 +215,7 @@ class _Types(_Walk):
             raise UnsuitedError("an array that is read later")
 
     def _keep(self, name: str, kind: Any) -> None:
-        if name in self.part.single:
+        if name in self.part.local:
             self.known[name] = kind
             return
         known = self.names.setdefault(name, kind)
@@ -698,11 +703,24 @@ class _Instructions(_Walk):
             compare = self.builder.fcmp_unordered if sign == "!=" else self.builder.fcmp_ordered
         return TRUTH, compare(sign, left, right)
 
+    def _is_risky(self, node: ast.expr) -> bool:
+        """Whether to evaluate what is not asked for might do harm, or take long."""
+        for part in ast.walk(node):
+            match part:
+                case ast.Subscript(ast.Name(name)) if name in self.names:
+                    if not isinstance(self.names[name][0], types.CPointer):
+                        return True  # an element may be outside
+                case ast.Subscript():
+                    return True
+                case ast.Call(function) if hasattr(self.function(function), "py_func"):
+                    return True
+        return False
+
     def _both(self, how: ast.boolop, first: ast.expr, rest: Sequence[ast.expr]) -> Typed:
         """Write tests, of which a later one may be evaluated only where it decides."""
         known = self.truth(first)
         for part in rest:
-            if not _is_risky(part):
+            if not self._is_risky(part):
                 write = self.builder.and_ if isinstance(how, ast.And) else self.builder.or_
                 known = write(known, self.truth(part))
                 continue
@@ -715,7 +733,7 @@ class _Instructions(_Walk):
         return TRUTH, known
 
     def _either(self, kind: Any, test: ast.expr, yes: ast.expr, no: ast.expr) -> Typed:
-        if not (_is_risky(yes) or _is_risky(no)):
+        if not (self._is_risky(yes) or self._is_risky(no)):
             return self.called(select, [self.value(part) for part in (test, yes, no)])
         place = cgutils.alloca_once(self.builder, self.context.get_value_type(kind))
         with self.builder.if_else(self.truth(test)) as (then, otherwise):
@@ -754,14 +772,6 @@ class _Instructions(_Walk):
         kind, (new, old) = self._alike([value, best])
         _, wins = self.compare(sign, (kind, new), (kind, old))
         return kind, self.builder.select(wins, new, old)
-
-
-def _is_risky(node: ast.expr) -> bool:
-    """Whether what is not asked for should not be evaluated: an element may be outside."""
-    return any(
-        isinstance(part, ast.Subscript | ast.Call | ast.FloorDiv | ast.Mod)
-        for part in ast.walk(node)
-    )
 
 
 def _instructions(kind: Any) -> Mapping[type[ast.operator], str]:
