@@ -28,6 +28,8 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import t as student
 
+from start import install
+
 HERE = Path(__file__).resolve().parents[1]
 
 #: Pairs of processes, one after another.
@@ -87,11 +89,14 @@ loop = ut.ClosedLoop(rig, ut.MinimumEnergy())
 loop.simulate(rig.state(phi=ut.deg(30)), ut.first_surface(rig), duration=0.1)
 """
 
+FIRST = f"{START}\nut.Cascade(rig, ut.MinimumEnergy()).start(rig.state(phi=ut.deg(30)))\n"
+
 
 class Build:
     """A checkout, and a process that works from its source."""
 
     def __init__(self, tree: Path, cache: Path) -> None:
+        self.package = tree / "src" / "undertow"
         self.environment = os.environ | {
             "PYTHONPATH": str(tree / "src"), "UNDERTOW_CACHE": str(cache),
             "PYTHONDONTWRITEBYTECODE": "",
@@ -129,6 +134,17 @@ class Build:
             environment = self.environment | ({"UNDERTOW_CACHE": folder} if empty else {})
             began = time.perf_counter()
             subprocess.run([sys.executable, "-c", code], env=environment, check=True)
+            return time.perf_counter() - began, ""
+
+    def first_answer(self) -> tuple[float, str]:
+        """Return the seconds to the first plan of a copy as pip leaves it, nothing compiled."""
+        with tempfile.TemporaryDirectory() as folder:
+            install(Path(folder), self.package)
+            environment = self.environment | {
+                "PYTHONPATH": folder, "UNDERTOW_CACHE": str(Path(folder) / "cache")
+            }  # fmt: skip
+            began = time.perf_counter()
+            subprocess.run([sys.executable, "-c", FIRST], env=environment, check=True)
             return time.perf_counter() - began, ""
 
 
@@ -171,6 +187,7 @@ def main() -> int:
             ("import", rounds // 2, methodcaller("start", IMPORT, empty=False)),
             ("start, second", rounds // 2, methodcaller("start", START, empty=False)),
             ("start, empty cache", max(3, rounds // 6), methodcaller("start", START, empty=True)),
+            ("first plan, as installed", max(3, rounds // 12), methodcaller("first_answer")),
         ]
         seconds: dict[str, dict[Build, list[float]]] = {}
         results: dict[str, dict[Build, str]] = {}

@@ -55,9 +55,9 @@ PACKAGE = Path(undertow.__file__).parent
 Parts = list[tuple[float, float]]
 
 
-def install(folder: Path) -> None:
+def install(folder: Path, package: Path = PACKAGE) -> None:
     """Put a copy of the package into a folder, with its bytecode, as pip does."""
-    shutil.copytree(PACKAGE, folder / "undertow", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(package, folder / "undertow", ignore=shutil.ignore_patterns("__pycache__"))
     subprocess.run([sys.executable, "-m", "compileall", "-q", str(folder)], check=True)
 
 
