@@ -201,3 +201,30 @@ def test_random_programs_give_the_bits_that_numba_gives(seed: int) -> None:
     for decorator in (compiled, lambda **_: compiled(pipeline_class=Straight)):
         assert _bits(decorator(cache=False)(plain)) == expected, source  # type: ignore[no-untyped-call]
     assert UNSUITED[before:] == [], source
+
+
+def test_rows_of_any_layout_are_read_and_written_but_not_those_that_are_read_only() -> None:
+    """What needs more than parts do is numba's again, with numba's refusal."""
+    rows = load_module(
+        "rows",
+        f"""{HEAD}
+@compiled(cache=False)
+def double(table, place):
+    total = 0.0
+    for i in range(table.shape[0]):
+        row = table[i]
+        for j in range(len(row)):
+            row[j] *= 2.0
+            total += row[j] * place[i % 2]
+    return total
+""",
+    ).double
+    place = np.array([1.0, 10.0])
+    for table in (np.arange(6.0).reshape(3, 2), np.asfortranarray(np.arange(6.0).reshape(3, 2))):
+        expected = 2.0 * (table.sum(axis=1) * [1.0, 10.0, 1.0]).sum()
+        assert rows(table, place) == expected
+        np.testing.assert_array_equal(table.ravel(), 2.0 * np.arange(6.0))
+    fixed = np.arange(6.0).reshape(3, 2)
+    fixed.flags.writeable = False
+    with pytest.raises(numba.core.errors.TypingError, match="Cannot modify readonly array"):
+        rows(fixed, place)

@@ -68,6 +68,9 @@ class Usual(compiler.Compiler):  # type: ignore[misc]
                 state.locals,
             )
             return compiler.CompilerBase.compile_extra(again, function)
+        finally:
+            for part in parts:
+                part.leave(self.state.targetctx)
 
 
 class Straight(Usual):

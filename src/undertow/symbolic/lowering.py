@@ -84,6 +84,10 @@ class Part:
         typing_context.insert_global(part, types.Function(Template))
         target_context.insert_func_defn([(write, part, (types.VarArg(types.Any),))])
 
+    def leave(self, target_context: Any) -> None:
+        """Let numba forget it: what calls it is compiled."""
+        target_context.remove_user_function(self)
+
 
 def _local(body: Sequence[ast.stmt], shared: Sequence[str]) -> set[str]:
     """Return the names that each list of lines that holds them begins by assigning.
@@ -204,15 +208,10 @@ class _Types(_Walk):
             self.result = self.returned
         else:
             found = [self.names[name] for name in part.results]
-            self.result = (
-                types.none
-                if not found
-                else found[0]
-                if len(found) == 1
-                else types.BaseTuple.from_types(found)
-            )
-        if any(isinstance(self.names[n], types.Array) for n in part.results):
-            raise UnsuitedError("an array that is read later")
+            if any(isinstance(kind, types.Array) for kind in found):
+                raise UnsuitedError("an array that is read later")
+            several = types.BaseTuple.from_types(found)
+            self.result = types.none if not found else found[0] if len(found) == 1 else several
 
     def _keep(self, name: str, kind: Any) -> None:
         if name in self.part.local:
@@ -270,8 +269,10 @@ class _Types(_Walk):
         match target:
             case ast.Name(name):
                 self._keep(name, kind)
-            case ast.Subscript():
-                if isinstance(self.kind(_loaded(target)), types.Array):
+            case ast.Subscript(value):
+                array = self.kind(value)
+                fixed = isinstance(array, types.BaseTuple) or not getattr(array, "mutable", True)
+                if fixed or isinstance(self.element(array, target), types.Array):
                     raise UnsuitedError(ast.unparse(target))
             case ast.Tuple(parts) if isinstance(kind, types.BaseTuple):
                 for part, each in zip(parts, kind, strict=True):
@@ -366,13 +367,17 @@ class _Types(_Walk):
         if isinstance(kind, types.CPointer) and len(parts) == 1:
             return kind.dtype
         if isinstance(kind, types.Array) and len(parts) <= kind.ndim:
-            left = kind.ndim - len(parts)
-            return kind.copy(ndim=left) if left else kind.dtype
+            return _row(kind, len(parts)) if len(parts) < kind.ndim else kind.dtype
         raise UnsuitedError(ast.unparse(node))
 
     def called(self, function: Any, kinds: Sequence[Any]) -> Any:
         """Return the type of what a function returns."""
         return _resolved(self.context, function, kinds)[1].return_type
+
+
+def _row(kind: Any, count: int) -> Any:
+    """Return the type of what so many indices leave of an array."""
+    return kind.copy(ndim=kind.ndim - count, layout="C" if kind.layout == "C" else "A")
 
 
 def _loaded(target: ast.expr) -> ast.expr:
@@ -458,7 +463,7 @@ class _Instructions(_Walk):
                 self.assign(target, self.binary(how, before, self.value(part)))
             case ast.AugAssign(ast.Subscript() as target, how, part):
                 kind, place, array = self.place(target)
-                before = kind, self._read(kind, place, array)
+                before = kind, self._read(place, array)
                 self._store(kind, place, array, self.binary(how, before, self.value(part)))
             case ast.For(ast.Name(name), ast.Call(_, limits), inner):
                 self._for(name, limits, inner)
@@ -552,8 +557,7 @@ class _Instructions(_Walk):
         else:
             arrays.store_item(self.context, self.builder, array, self.cast(kind, value), place)
 
-    def _read(self, kind: Any, place: Any, array: Any) -> Any:
-        del kind
+    def _read(self, place: Any, array: Any) -> Any:
         if array is None:
             return self.builder.load(place)
         return arrays.load_item(self.context, self.builder, array, place)
@@ -640,8 +644,8 @@ class _Instructions(_Walk):
             return self.called(operator.getitem, [(kind, base), self.value(parts[0])])
         if isinstance(kind, types.CPointer) or len(parts) == kind.ndim:
             found, place, array = self.place(node)
-            return found, self._read(found, place, array)
-        row = kind.copy(ndim=kind.ndim - len(parts))
+            return found, self._read(place, array)
+        row = _row(kind, len(parts))
         whole = self.context.make_array(kind)(self.context, self.builder, base)
         where = [self.cast(WHOLE, self.value(part)) for part in parts]
         made = self.context.make_array(row)(self.context, self.builder)
