@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.optimize import linprog
 
 from undertow.closed_loop import Trajectory
 from undertow.models import FloatArray, Mechanism
@@ -325,6 +324,8 @@ class _Program:
         The end stays within a box of ``radius`` and on the near side of the cuts, directions (2n,):
         tangents to the terminal ball where earlier steps left it.
         """
+        from scipy.optimize import linprog  # slow to import
+
         low = np.maximum(np.minimum(self.low[:, 1:], 0.0), -trust)
         high = np.minimum(np.maximum(self.high[:, 1:], 0.0), trust)
         low[:, -1] = (-radius - self.end) / self.scale
