@@ -20,6 +20,7 @@ import undertow as ut
 from undertow.cascade import CascadeState
 from undertow.law import Plan
 from undertow.runtime import Recipe
+from undertow.symbolic.compiler import UNSUITED
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -80,6 +81,13 @@ def pytest_configure(config: pytest.Config) -> None:
     cache = getattr(config, "cache", None)  # absent with -p no:cacheprovider
     if cache is not None:
         os.environ.setdefault("UNDERTOW_CACHE", str(cache.mkdir("kernels")))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def plain_lines_are_plain() -> Iterator[None]:
+    """What is taken for plain in a compiled function never turns out to need numba."""
+    yield
+    assert UNSUITED == []
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -228,3 +228,4 @@ def double(table, place):
     fixed.flags.writeable = False
     with pytest.raises(numba.core.errors.TypingError, match="Cannot modify readonly array"):
         rows(fixed, place)
+    assert "double" in UNSUITED.pop()
