@@ -401,7 +401,7 @@ def look_source(program: LoopGraph, *, header: str) -> str:
     }
     return f"{docstring(header)}{PREAMBLE}{PRIMITIVES}" + "".join(
         f"\n\n@compiled({_LOOK}, no_cfunc_wrapper=False, pipeline_class=Straight, "
-        " fastmath={'contract', 'nsz', 'arcp'})\n"
+        "fastmath={'contract', 'nsz', 'arcp'})\n"
         f"def {name}(t, x, lane, plant, belief, limits, u, seen, rates):\n"
         f"{textwrap.indent(chr(10).join(lines), '    ')}\n"
         for name, lines in functions.items()

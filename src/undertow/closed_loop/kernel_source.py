@@ -428,9 +428,8 @@ def kernel_source(program: LoopGraph, *, header: str) -> str:
                 sample = min(step // zoh_steps, noise.shape[0] - 1)
 {_groups(w.sample(), 4)}
 """
-    source = f"""{docstring(header)}import math
+    return f"""{docstring(header)}import math
 
-import numba
 import numpy as np
 {PRIMITIVES}
 
@@ -487,7 +486,6 @@ def rollout(
         groups = min({GROUPS}, (to_lane - b) // {LANES})
 {_groups(w.collect(), 2)}
 {"" if program.sampled else _etd_integrate(w)}"""
-    return source
 
 
 def _etd_integrate(w: _Writer) -> str:

@@ -54,9 +54,8 @@ def _source(N: int) -> str:
         *read_turned,
         *(f"o[{e}] = add[{e}] + {v}" for e, v in zip(places, entries, strict=True)),
     ]
-    source = f'''"""Linear systems of order {N}; generated, do not edit."""
+    return f'''"""Linear systems of order {N}; generated, do not edit."""
 
-import numba
 {PRIMITIVES}
 inner = compiled(
     no_cpython_wrapper=True, pipeline_class=Straight, fastmath={{"contract", "nsz", "arcp"}}
@@ -168,7 +167,6 @@ def double(A, Q, P, stable, powers, forced):
                 for c in range({N}):
                     P[first + i, r, c] = X[(r * {N} + c) * {LANES} + i]
 '''
-    return source
 
 
 def _indented(lines: list[str]) -> str:

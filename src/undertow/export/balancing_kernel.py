@@ -104,9 +104,8 @@ def _source(mechanism: Mechanism, stage: sp.Expr, margins: list[sp.Expr], header
     ]
     constants = [f"{emit.text(s)} = plant[{j}]" for j, s in enumerate(mechanism.parameter_symbols)]
     table = ", ".join(str(part) for part in zip(*_STAGES, strict=True))
-    source = f"""{docstring(header)}import math
+    return f"""{docstring(header)}import math
 
-import numba
 import numpy as np
 {PRIMITIVES}
 
@@ -128,7 +127,6 @@ def advance(x, u, t, cost, margin, plant, h, steps):
         into = steps * h
 {_loop(give, 2)}
 """
-    return source
 
 
 def _lines(lines: list[str], depth: int) -> str:
