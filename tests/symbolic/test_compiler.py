@@ -124,6 +124,7 @@ class Program:
             lambda: [f"b[{self.place(3)}, {self.place(2)}] -= {self.real(1)}"],
             lambda: [f"n[{self.place(2)}] = ({self.whole()}) % 7"],
             lambda: [f"row = b[{self.place(3)}]", f"kept = row[{self.place(2)}]"],
+            lambda: [f"view = a[{self.random.randrange(3)} :]", "kept += view[0]"],
             lambda: [f"y = {self.real(1)}", f"a[{self.place(4)}] = y * y"],
             lambda: [f"y = {self.real(0)}", f"if {self.truth(0)}:", "    y = 2.0", "kept -= y"],
         ]
@@ -226,3 +227,25 @@ def double(table, place):
     with pytest.raises(numba.core.errors.TypingError, match="Cannot modify readonly array"):
         rows(fixed, place)
     assert "double" in UNSUITED.pop()
+
+
+def test_what_a_turn_that_ends_early_leaves_is_read_in_the_next_one() -> None:
+    """Although the lines behind would assign it: between them is one that numba keeps."""
+    function = load_module(
+        "early",
+        f"""{HEAD}
+@compiled(cache=False)
+def total(a):
+    x, total = 1.0, 0.0
+    for i in range(len(a)):
+        total += x
+        x = 2.0 * a[i] + 1.0 - 0.5 * a[0]
+        view = a[i:]
+        if view[0] > 0.0:
+            continue
+        x = 0.0
+    return total
+""",
+    ).total
+    a = np.array([1.0, -1.0, 2.0, 3.0])
+    assert function(a) == function.py_func(a)

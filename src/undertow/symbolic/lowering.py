@@ -11,7 +11,6 @@ import ast
 import builtins
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from functools import reduce
 from typing import Any
 
@@ -176,6 +175,26 @@ class _Walk:
                 return self.part.scope[name]
         raise UnsuitedError(ast.unparse(node))
 
+    def assign_all(
+        self, targets: Sequence[ast.expr], value: ast.expr, found: Callable[[ast.expr], Any]
+    ) -> None:
+        """Assign what is found of a value: of a tuple's parts each to its own name."""
+        match value:
+            case ast.Tuple(parts) if any(isinstance(target, ast.Tuple) for target in targets):
+                each = [found(part) for part in parts]
+                for target in targets:
+                    assert isinstance(target, ast.Tuple)
+                    for name, one in zip(target.elts, each, strict=True):
+                        self.assign(name, one)
+            case _:
+                whole = found(value)
+                for target in targets:
+                    self.assign(target, whole)
+
+    def assign(self, target: ast.expr, found: Any) -> None:
+        """Assign what was found of a value."""
+        raise NotImplementedError
+
 
 def parts_of(node: ast.Subscript) -> list[ast.expr]:
     """Return the indices of an element."""
@@ -227,14 +246,8 @@ class _Types(_Walk):
         """Find the types of what lines assign."""
         for line in lines:
             match line:
-                case ast.Assign(targets, ast.Tuple(parts)) if isinstance(targets[0], ast.Tuple):
-                    kinds = [self.kind(part) for part in parts]
-                    for target, kind in zip(targets[0].elts, kinds, strict=True):
-                        self.assign(target, kind)
                 case ast.Assign(targets, part):
-                    kind = self.kind(part)
-                    for target in targets:
-                        self.assign(target, kind)
+                    self.assign_all(targets, part, self.kind)
                 case ast.AugAssign(target, how, part):
                     reading = ast.copy_location(_loaded(target), target)
                     self.assign(target, self.kind(ast.BinOp(reading, how, part)))
@@ -264,18 +277,18 @@ class _Types(_Walk):
         if not isinstance(self.kind(node), types.Integer):
             raise UnsuitedError(ast.unparse(node))
 
-    def assign(self, target: ast.expr, kind: Any) -> None:
+    def assign(self, target: ast.expr, found: Any) -> None:
         """Note the type of what is assigned."""
         match target:
             case ast.Name(name):
-                self._keep(name, kind)
+                self._keep(name, found)
             case ast.Subscript(value):
                 array = self.kind(value)
                 fixed = isinstance(array, types.BaseTuple) or not getattr(array, "mutable", True)
                 if fixed or isinstance(self.element(array, target), types.Array):
                     raise UnsuitedError(ast.unparse(target))
-            case ast.Tuple(parts) if isinstance(kind, types.BaseTuple):
-                for part, each in zip(parts, kind, strict=True):
+            case ast.Tuple(parts) if isinstance(found, types.BaseTuple):
+                for part, each in zip(parts, found, strict=True):
                     self.assign(part, each)
             case _:
                 raise UnsuitedError(ast.unparse(target))
@@ -450,14 +463,8 @@ class _Instructions(_Walk):
     def line(self, line: ast.stmt) -> None:
         """Write one line."""
         match line:
-            case ast.Assign(targets, ast.Tuple(parts)) if isinstance(targets[0], ast.Tuple):
-                values = [self.value(part) for part in parts]
-                for target, value in zip(targets[0].elts, values, strict=True):
-                    self.assign(target, value)
             case ast.Assign(targets, part):
-                value = self.value(part)
-                for target in targets:
-                    self.assign(target, value)
+                self.assign_all(targets, part, self.value)
             case ast.AugAssign(ast.Name(name) as target, how, part):
                 before = self.value(ast.Name(name, ast.Load()))
                 self.assign(target, self.binary(how, before, self.value(part)))
@@ -468,12 +475,13 @@ class _Instructions(_Walk):
             case ast.For(ast.Name(name), ast.Call(_, limits), inner):
                 self._for(name, limits, inner)
             case ast.While(test, inner):
-                with self._loop() as (again, end):
-                    self._branch(test, end)
-                    self.lines(inner)
-                    self._go(again)
+                again, turn, end = self._blocks(3)
+                self._begin(again)
+                self.builder.cbranch(self.truth(test), turn, end)
+                self._turn(turn, inner, again, end)
+                self.builder.position_at_end(end)
             case ast.If(test, yes, no):
-                yes_block, no_block, end = (self.builder.append_basic_block() for _ in range(3))
+                yes_block, no_block, end = self._blocks(3)
                 self.builder.cbranch(self.truth(test), yes_block, no_block)
                 for block, inner in ((yes_block, yes), (no_block, no)):
                     self.builder.position_at_end(block)
@@ -496,21 +504,21 @@ class _Instructions(_Walk):
         if not self.builder.block.is_terminated:
             self.builder.branch(block)
 
-    def _branch(self, test: ast.expr, end: Any) -> None:
-        """Go on where a test holds, else to the end."""
-        on = self.builder.append_basic_block()
-        self.builder.cbranch(self.truth(test), on, end)
-        self.builder.position_at_end(on)
+    def _begin(self, block: Any) -> None:
+        """Go on in a new block."""
+        self.builder.branch(block)
+        self.builder.position_at_end(block)
 
-    @contextmanager
-    def _loop(self) -> Iterator[tuple[Any, Any]]:
-        again, end = self.builder.append_basic_block(), self.builder.append_basic_block()
-        self._go(again)
-        self.builder.position_at_end(again)
+    def _blocks(self, count: int) -> list[Any]:
+        return [self.builder.append_basic_block() for _ in range(count)]
+
+    def _turn(self, block: Any, lines: Sequence[ast.stmt], again: Any, end: Any) -> None:
+        """Write a turn of a loop; ``again`` and ``end``: where it and the loop end."""
+        self.builder.position_at_end(block)
         self.loops.append((again, end))
-        yield again, end
+        self.lines(lines)
         self.loops.pop()
-        self.builder.position_at_end(end)
+        self._go(again)
 
     def _for(self, name: str, limits: Sequence[ast.expr], inner: Sequence[ast.stmt]) -> None:
         values = [self.cast(WHOLE, self.value(limit)) for limit in limits]
@@ -518,37 +526,31 @@ class _Instructions(_Walk):
         first = llvm.Constant(llvm.IntType(64), 0) if len(values) < 2 else values[0]
         stop = values[0] if len(values) < 2 else values[1]
         counter = cgutils.alloca_once_value(self.builder, first)
-        self.builder.store(first, counter)
-        head, next_, end = (self.builder.append_basic_block() for _ in range(3))
-        body = self.builder.append_basic_block()
-        self.builder.branch(head)
-        self.builder.position_at_end(head)
+        head, turn, next_, end = self._blocks(4)
+        self._begin(head)
         at = self.builder.load(counter)
         sign = ">" if step.constant < 0 else "<"
-        self.builder.cbranch(self.builder.icmp_signed(sign, at, stop), body, end)
-        self.builder.position_at_end(body)
+        self.builder.cbranch(self.builder.icmp_signed(sign, at, stop), turn, end)
+        self.builder.position_at_end(turn)
         self.assign(ast.Name(name), (WHOLE, at))
-        self.loops.append((next_, end))
-        self.lines(inner)
-        self.loops.pop()
-        self._go(next_)
+        self._turn(turn, inner, next_, end)
         self.builder.position_at_end(next_)
         self.builder.store(self.builder.add(at, step, flags=("nsw",)), counter)
         self.builder.branch(head)
         self.builder.position_at_end(end)
 
-    def assign(self, target: ast.expr, value: Typed) -> None:
+    def assign(self, target: ast.expr, found: Typed) -> None:
         """Write a value to where it belongs."""
         match target:
             case ast.Name(name) if name in self.places:
-                self.builder.store(self.cast(self.kinds.names[name], value), self.places[name])
+                self.builder.store(self.cast(self.kinds.names[name], found), self.places[name])
             case ast.Name(name):
-                self.names[name] = value
+                self.names[name] = found
             case ast.Subscript():
-                self._store(*self.place(target), value)
+                self._store(*self.place(target), found)
             case ast.Tuple(parts):
-                each = cgutils.unpack_tuple(self.builder, value[1])
-                for part, kind, one in zip(parts, value[0], each, strict=True):
+                each = cgutils.unpack_tuple(self.builder, found[1])
+                for part, kind, one in zip(parts, found[0], each, strict=True):
                     self.assign(part, (kind, one))
 
     def _store(self, kind: Any, place: Any, array: Any, value: Typed) -> None:

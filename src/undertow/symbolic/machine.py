@@ -22,6 +22,7 @@ for functions of this package alone; other people's are compiled as ever.
 from __future__ import annotations
 
 import gc
+import hashlib
 import os
 import platform
 from contextlib import nullcontext, suppress
@@ -64,9 +65,19 @@ class _PrivateLocator(caching._SourceFileBackedLocatorMixin, caching._CacheLocat
     def get_cache_path(self) -> str:
         return self._cache_path
 
+    def get_source_stamp(self) -> Any:
+        """Return what says that a source has changed, or this folder, which makes code of it."""
+        return super().get_source_stamp(), _compiler_stamp()
+
     @classmethod
     def from_function(cls, function: Any, file: str) -> Any:
         return super().from_function(function, file) if _is_ours(file) else None
+
+
+@lru_cache(maxsize=1)
+def _compiler_stamp() -> str:
+    files = sorted(Path(__file__).parent.glob("*.py"))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
 def _is_ours(file: str) -> bool:

@@ -19,11 +19,11 @@ from undertow.symbolic.primitives import select
 
 def outline(function: Any) -> tuple[Any, list[Part]]:
     """Return a function that calls parts where another one's lines are plain, and the parts."""
+    if function.__closure__:
+        return function, []
     (definition,) = ast.parse(textwrap.dedent(inspect.getsource(function))).body
     assert isinstance(definition, ast.FunctionDef)
     definition.decorator_list, definition.returns = [], None
-    if function.__closure__:
-        return function, []
     outliner = _Outliner(definition, function.__globals__)
     outliner.outline()
     module = ast.fix_missing_locations(ast.Module([definition], []))
@@ -56,10 +56,8 @@ class _Outliner:
         if isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant):
             body = body[1:]
         if body and all(self.is_plain(line, whole=True) for line in body):
-            part = self._part(body, set())
-            part_call = self._call(part)
-            leaves = any(isinstance(n, ast.Return) for line in body for n in ast.walk(line))
-            self.function.body = [ast.Return(part_call) if leaves else ast.Expr(part_call)]
+            part, call = self._part(body, set())
+            self.function.body = [ast.Return(call) if part.returns else ast.Expr(call)]
         else:
             self.function.body = self._lines(body, set())
 
@@ -71,9 +69,9 @@ class _Outliner:
             if line is not None and self.is_plain(line):
                 run.append(line)
                 continue
-            rest = lines[k:]
             if run:
-                later = _exposed(rest, self.own) | (after - _assigned(rest))
+                # What the rest assigns may be read all the same: a turn of a loop may end before.
+                later = _exposed(lines[k:], self.own) | after
                 rows = _stored(run) & later & self.rows
                 if rows:  # which numba has to keep
                     self.rows, self.kept = self.rows - rows, self.kept | rows
@@ -100,8 +98,7 @@ class _Outliner:
         """Return the call of a part, or the lines themselves where that would cost more."""
         if sum(1 for line in run for _ in ast.walk(line)) < self.WORTH:
             return run
-        part = self._part(run, after)
-        call = self._call(part)
+        part, call = self._part(run, after)
         match part.results:
             case []:
                 return [ast.Expr(call)]
@@ -110,13 +107,15 @@ class _Outliner:
         names = ast.Tuple([ast.Name(name, ast.Store()) for name in part.results], ast.Store())
         return [ast.Assign([names], call)]
 
-    def _part(self, body: list[ast.stmt], after: set[str]) -> Part:
+    def _part(self, body: list[ast.stmt], after: set[str]) -> tuple[Part, ast.Call]:
+        """Return a part and a call of it; ``after``: names that are read behind it."""
         results = sorted(_stored(body) & after)
         reads = _exposed(body, self.own) | (set(results) - _assigned(body))
         inputs = sorted(reads & {*self.given, *self._assigned_outside(body)})
-        part = Part(body, inputs, results, self.scope)
-        self.parts[f"_part_{len(self.parts)}"] = part
-        return part
+        name, part = f"_part_{len(self.parts)}", Part(body, inputs, results, self.scope)
+        self.parts[name] = part
+        given: list[ast.expr] = [ast.Name(each, ast.Load()) for each in inputs]
+        return part, ast.Call(ast.Name(name, ast.Load()), given, [])
 
     def _assigned_outside(self, run: list[ast.stmt]) -> set[str]:
         """Return the names that the function assigns in other lines than those of a run."""
@@ -133,11 +132,6 @@ class _Outliner:
 
         return found(self.function.body)
 
-    def _call(self, part: Part) -> ast.Call:
-        (name,) = (name for name, known in self.parts.items() if known is part)
-        given: list[ast.expr] = [ast.Name(each, ast.Load()) for each in part.inputs]
-        return ast.Call(ast.Name(name, ast.Load()), given, [])
-
     # what is plain
 
     def is_plain(self, line: ast.stmt, *, whole: bool = False, loop: bool = False) -> bool:
@@ -149,7 +143,8 @@ class _Outliner:
                 parts = [t.elts for t in targets if isinstance(t, ast.Tuple)]
                 match value:
                     case ast.Tuple(values):
-                        plain = bool(parts) and all(len(each) == len(values) for each in parts)
+                        same = all(len(each) == len(values) for each in parts)
+                        plain = same and len(parts) == len(targets)
                     case ast.Call() | ast.Attribute():
                         plain = True
                     case _:
