@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from typer.testing import CliRunner
 
 from undertow.cli import app
-from undertow.runtime import Recipe
+from undertow.runtime import Recipe, Report, Runtime
 
 RECIPE = Recipe(parameters={"d_e": 0.025}, evaluations=64, start=(0.0, 0.3, 0.0, 0.0))
 
@@ -16,3 +18,18 @@ def run(*words: str) -> tuple[int, str, str]:
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     return result.exit_code, result.stdout, result.stderr
+
+
+def run_until(runtime: Runtime, done: Callable[[Report], bool]) -> Report:
+    """Run against the clock until something was seen, however late a busy machine makes it."""
+    read = runtime.rig.read
+
+    def reading() -> object:
+        if done(runtime.report):
+            runtime.stop()
+        return read()
+
+    runtime.rig.read = reading  # type: ignore[method-assign, assignment]
+    report = runtime.run(120.0)
+    assert report.stopped_by == "operator: stop"
+    return report

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import undertow as ut
+from runs import run_until
 from undertow.base import ArtefactError, InvalidInputError
 from undertow.cascade import CascadeState
 from undertow.law import ReferenceMotion
@@ -474,7 +475,12 @@ def test_against_the_clock_another_process_steers_the_run(tmp_path: Path) -> Non
         assert runtime.deaf == ""
         asking = threading.Thread(target=ask)
         asking.start()
-        report = runtime.run(5.0)
+        report = run_until(
+            runtime,
+            lambda report: (
+                report.steps > 5000 and any("jumps" in text for _, text in of_target(report))
+            ),
+        )
         asking.join()
     assert found[0].ahead[0][1] == {"theta": 0.4}
     assert "jumps" in of_target(report)[-1][1]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import undertow as ut
-from runs import run
+from runs import run, run_until
 from undertow.base import InvalidInputError
 from undertow.cascade import CascadeState
 from undertow.law import ReferenceMotion
@@ -98,11 +98,13 @@ def test_after_a_swing_up_it_follows_the_reference(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_against_the_clock_processes_share_the_reference(tmp_path: Path) -> None:
+    """Until answers were used, however late a busy machine makes them."""
     log = tmp_path / "run.db"
     with session(replace(RECIPE, seconds=0.03), log=log, processes=1) as runtime:
-        report = runtime.run(5.0)
+        report = run_until(
+            runtime, lambda report: report.steps > 5000 and report.answers["applied"] > 3
+        )
         assert runtime.controller.memory.target is runtime.controller.reference
-    assert report.answers["applied"] > 3
     assert not report.lockstep_mismatches
     arm, _ = off(log, 4.0)
     assert arm < 3.0
