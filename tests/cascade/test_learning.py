@@ -581,7 +581,7 @@ def test_a_first_plan_looks_ahead_to_the_next_decision(pendulum: ut.Mechanism) -
     assert proposed.cost <= alone.cost
     assert proposed.incumbent_cost == alone.incumbent_cost
     # Nothing is looked ahead to where states have errors: what is chosen has to suit all plants.
-    noisy = replace(made, covariance=1e-8 * np.eye(4))
+    noisy = replace(made, covariance=1e-8 * np.eye(4), cold=ut.Budget(64))
     assert noisy.start(x)[0].ahead is None
 
 

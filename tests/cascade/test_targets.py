@@ -153,7 +153,7 @@ def test_what_takes_over_after_a_jump_keeps_within_the_travel_about_a_target_too
 def test_what_takes_over_after_a_jump_is_chosen_by_its_size() -> None:
     """A small push is not met as a large one is: the cart would spend its whole input on it."""
     cart = ut.mechanisms.cart_pendulum()
-    cascade = ut.Cascade(cart, ut.objective_for(cart, "effort"))
+    cascade = ut.Cascade(cart, ut.objective_for(cart, "effort"), cold=ut.Budget(256))
     x = cart.usual_start
     state, _ = cascade.start(x)
     assert cascade.after_jump(state, x) == cascade.reserve[-1]  # nothing was asked for before

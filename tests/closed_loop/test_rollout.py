@@ -995,11 +995,11 @@ def test_a_motion_that_begins_outside_of_a_constraint_may_come_back_once() -> No
     surfaces = base * (1 + 0.3 * rng.standard_normal((48, base.size)))
     x = cart.state(x=edge + 0.02, phi=0.05, x_dot=0.2)
     seen = set()
+    motions = [free.simulate(x, ut.Surface(*vector)) for vector in surfaces]
     for precise in (False, True):
         assert (strict.batch(x, surfaces, precise=precise).time == 0).all()
         batch = returning.batch(x, surfaces, precise=precise)
-        for k in range(len(surfaces)):
-            motion = free.simulate(x, ut.Surface(*surfaces[k]))
+        for k, motion in enumerate(motions):
             excess = np.maximum(np.abs(motion["x"]) - edge, 0.0)
             inside = np.flatnonzero(excess == 0)
             back = inside[0] if len(inside) else len(excess)
