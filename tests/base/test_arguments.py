@@ -7,6 +7,7 @@ called what others are called.
 
 from __future__ import annotations
 
+import dataclasses
 import enum
 import inspect
 import math
@@ -367,3 +368,23 @@ def test_an_unknown_argument_is_refused_with_those_that_are_like_it(rig: ut.Mech
         InvalidInputError, match=r"argument of ClosedLoop.simulate: .*mean duration"
     ):
         loop.simulate(rig.state(), ut.first_surface(rig), durations=1.0)  # type: ignore[call-arg]
+
+
+RESULTS = ("LoopMargins", "MechanismReport", "Proposal", "Run", "Trajectory")
+
+#: Dataclasses that users make.
+MADE_BY_USERS = [
+    owner
+    for room in (ut, ut.plants, ut.runtime, ut.export)
+    for name, owner in ((name, getattr(room, name)) for name in room.__all__)
+    if dataclasses.is_dataclass(owner) and (room is ut or hasattr(owner, "__post_init__"))
+    if name not in RESULTS and isinstance(owner, type)
+]
+
+
+@pytest.mark.parametrize("owner", MADE_BY_USERS, ids=lambda owner: owner.__qualname__)
+def test_an_unknown_field_is_refused_with_those_that_are_like_it(owner: type) -> None:
+    name = list(inspect.signature(owner).parameters)[-1]
+    said = rf"argument of {owner.__qualname__}: got '{name}x', .*Did you mean .*{name}\b"
+    with pytest.raises(InvalidInputError, match=said):
+        owner(**{f"{name}x": None})

@@ -1,7 +1,8 @@
 """Checks of arguments against their annotations.
 
 All public functions use them: :func:`checked` reads the annotations of a function or method,
-:func:`check_fields` those of a dataclass.  Ranges and shapes are checked where values are used.
+:func:`checked_names` and :func:`check_fields` the fields of a dataclass.  Ranges and
+shapes are checked where values are used.
 """
 
 from __future__ import annotations
@@ -64,6 +65,7 @@ _ARRAY, _SHOWN = "array", 80
 
 P = ParamSpec("P")
 R = TypeVar("R")
+C = TypeVar("C")
 K = TypeVar("K")
 V = TypeVar("V")
 
@@ -120,9 +122,7 @@ Give a number in SI units: undertow.deg(10) for an angle of 10°
                 given = (*given[:k], float(cast(float, value)), *given[k + 1 :])
         for name, value in kwargs.items():
             if name not in words and others is None:
-                one_of(
-                    f"argument of {function.__qualname__}", name, sorted(words - {"self", "cls"})
-                )
+                one_of(f"argument of {_called(function)}", name, sorted(words - {"self", "cls"}))
             parameter = name if name in words else others
             test = tests.get(parameter)
             if test is not None and not test(value):
@@ -132,6 +132,26 @@ Give a number in SI units: undertow.deg(10) for an angle of 10°
         return function(*given, **kwargs)  # of a missing name Python itself tells
 
     return call
+
+
+def checked_names(owner: type[C]) -> type[C]:
+    """Have a keyword that is no field of a dataclass refused, with those that are like it.
+
+    What the fields themselves are is for :func:`check_fields`.  Raises InvalidInputError where one
+    is made.
+    """
+    made: Any = owner.__init__
+    words = sorted(set(inspect.signature(made).parameters) - {"self"})
+
+    @wraps(made)
+    def init(self: C, *args: Any, **kwargs: Any) -> None:
+        for name in kwargs:
+            if name not in words:
+                one_of(f"argument of {_called(owner)}", name, words)
+        made(self, *args, **kwargs)
+
+    owner.__init__ = init  # type: ignore[assignment]
+    return owner
 
 
 class ReadOnly(Mapping[K, V]):
@@ -320,11 +340,16 @@ def _refuse(of: Any, parameter: str | None, value: object, name: str = "") -> No
     if isinstance(value, str) and "a sequence of names" in map(_words, members):
         remedies = [f"Write [{value!r}]"]
     raise InvalidInputError(
-        f"{name or parameter} of {of.__qualname__}",
+        f"{name or parameter} of {_called(of)}",
         value=_shown(value),
         limit=" or ".join(_words(m) for m in members),
         remedy=next((r for r in remedies if r), "Its documentation shows what it takes"),
     )
+
+
+def _called(of: Any) -> str:
+    """Return the name that a function or class is called by."""
+    return str(of.__qualname__).removesuffix(".__init__")
 
 
 def _shown(value: object) -> str:

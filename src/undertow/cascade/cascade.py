@@ -21,6 +21,7 @@ from undertow.base import (
     between,
     check_fields,
     checked,
+    checked_names,
     instant,
     one_of,
     positive,
@@ -65,6 +66,7 @@ from undertow.optimiser import Budget, DecisionVariables, Optimiser, Planner, Pr
 _USUAL = cast(Objective, None)
 
 
+@checked_names
 @dataclass(frozen=True, eq=False)
 class Cascade:
     """The controller a user runs: law, optimiser and gate.

@@ -27,6 +27,7 @@ from undertow.base import (
     between,
     check_fields,
     checked,
+    checked_names,
     floats,
     positive,
     require,
@@ -105,6 +106,7 @@ class LoopNumbers(NamedTuple):
     coupling: FloatArray
 
 
+@checked_names
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
     """A mechanism under its sliding-mode law, compiled for batches of rollouts.

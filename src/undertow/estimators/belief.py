@@ -31,6 +31,7 @@ from undertow.base import (
     ReadOnly,
     check_fields,
     checked,
+    checked_names,
     floats,
     one_for_each,
     one_of,
@@ -141,6 +142,7 @@ def _moves_target(mechanism: Mechanism, place: int, change: float) -> bool:
     return max(abs(float(f)) for f in force[mechanism.m :]) > AT_REST * force_scale(mechanism)
 
 
+@checked_names
 @dataclass(frozen=True, eq=False)
 class Belief:
     """A mechanism and what is not known of it.

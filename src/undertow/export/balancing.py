@@ -19,6 +19,7 @@ from undertow.base import (
     between,
     check_fields,
     checked,
+    checked_names,
     floats,
     positive,
     require_extra,
@@ -51,6 +52,7 @@ MOST_STEPS = 10_000_000
 NEEDS = "environments need Gymnasium"
 
 
+@checked_names
 @dataclass(frozen=True, eq=False)
 class BalancingTask:
     """What an environment asks: bring a mechanism to its target at the least cost.

@@ -17,7 +17,15 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import InvalidInputError, check_fields, one_for_each, one_of, positive, require
+from undertow.base import (
+    InvalidInputError,
+    check_fields,
+    checked_names,
+    one_for_each,
+    one_of,
+    positive,
+    require,
+)
 from undertow.export.estimate import DerivativeStep, EstimatorStep, KalmanStep
 from undertow.export.names import HEADERS, c_name
 from undertow.law import (
@@ -34,6 +42,7 @@ from undertow.models import FloatArray, Mechanism
 from undertow.symbolic import Real, literal
 
 
+@checked_names
 @dataclass(frozen=True, eq=False)
 class EmbeddedController:
     """The inner loop of a mechanism, as it is to run on a microcontroller.

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from undertow.base import checked_names
 from undertow.law.schedule import Plan
 from undertow.law.sliding import LawSymbols, SlidingModeLaw, build_law_graph
 from undertow.law.surface import ReachingLaw, Surface, Switching
@@ -20,6 +21,7 @@ from undertow.models import FloatArray, Mechanism, linearise
 from undertow.symbolic import BRIEF, Tape, Workspace, function_source, scalar_module, unpacked
 
 
+@checked_names
 @dataclass(eq=False)
 class InnerLoop:
     """The sliding-mode law of a mechanism, compiled, with a surface that can be exchanged.

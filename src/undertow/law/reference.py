@@ -41,6 +41,7 @@ from undertow.base import (
     UndertowError,
     check_fields,
     checked,
+    checked_names,
     error_text,
     floats,
     one_of,
@@ -174,6 +175,7 @@ def reference_row(
 # -- set-points ------------------------------------------------------------------------------
 
 
+@checked_names
 @dataclass(frozen=True)
 class SetPoints:
     """Places to rest at, one after another, each at once.
@@ -404,6 +406,7 @@ class Differentiated:
         return r(t), *found
 
 
+@checked_names
 @dataclass(frozen=True)
 class Reference:
     """What actuated coordinates are to do over time: r(t) with two derivatives.

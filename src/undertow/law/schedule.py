@@ -15,7 +15,7 @@ from typing import Self
 
 import numpy as np
 
-from undertow.base import InvalidInputError, at_least, check_fields, checked
+from undertow.base import InvalidInputError, at_least, check_fields, checked, checked_names
 from undertow.law.surface import ReachingLaw, Surface
 from undertow.models import FloatArray
 
@@ -26,6 +26,7 @@ def rising_from_zero(times: Sequence[float]) -> bool:
     return len(times) > 0 and times[0] == 0 and rising and math.isfinite(times[-1])
 
 
+@checked_names
 @dataclass(frozen=True)
 class Plan:
     """Surfaces that take over one after another.

@@ -22,7 +22,14 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from undertow.base import REMEDIES, InvalidInputError, SingularSurfaceError, a_kind, check_fields
+from undertow.base import (
+    REMEDIES,
+    InvalidInputError,
+    SingularSurfaceError,
+    a_kind,
+    check_fields,
+    checked_names,
+)
 from undertow.law.surface import LawLayout, ReachingLaw, Surface, SurfaceBlocks, Switching
 from undertow.models import TIME, FloatArray, Mechanism, Partition
 from undertow.symbolic import Tape, compile_numpy
@@ -184,6 +191,7 @@ class Control(NamedTuple):
     margin: FloatArray
 
 
+@checked_names
 @dataclass(frozen=True, eq=False)
 class SlidingModeLaw:
     """The control law (5) with (12): a surface, a reaching law, actuator limits.

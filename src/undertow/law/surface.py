@@ -21,6 +21,7 @@ from undertow.base import (
     at_least,
     check_fields,
     checked,
+    checked_names,
     floats,
     one_of,
     positive,
@@ -314,6 +315,7 @@ class Surface:
         return f"Surface({', '.join(f'{k}={show(b)}' for k, b in self._blocks._asdict().items())})"
 
 
+@checked_names
 @dataclass(frozen=True)
 class ReachingLaw:
     """How the surface is reached: gain, boundary layer and switching function.

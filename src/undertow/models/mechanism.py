@@ -29,6 +29,7 @@ from undertow.base import (
     a_kind,
     check_fields,
     checked,
+    checked_names,
     floats,
     one_of,
     positive,
@@ -82,6 +83,7 @@ _IDENTITY = cast(sp.ImmutableDenseMatrix, None)
 _derived = lru_cache(maxsize=64)(derived)
 
 
+@checked_names
 @dataclass(frozen=True, eq=False)
 class Mechanism:
     """An underactuated mechanism ``M(q) q̈ = f(q, q̇) + (B u, 0)``: immutable.

@@ -15,7 +15,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike, NDArray
 
-from undertow.base import InvalidInputError, a_kind, one_of, positive
+from undertow.base import InvalidInputError, a_kind, checked_names, one_of, positive
 
 FloatArray = NDArray[np.float64]
 
@@ -166,6 +166,7 @@ class _Named:
         object.__setattr__(self, "unit", normal_unit(unit))
 
 
+@checked_names
 @dataclass(frozen=True)
 class Parameter(_Named):
     """A physical parameter: a number with its unit, its bounds and where it comes from.
@@ -248,6 +249,7 @@ def with_value(parameter: Parameter, value: float) -> Parameter:
     return other
 
 
+@checked_names
 @dataclass(frozen=True)
 class Coordinate(_Named):
     """A generalised coordinate; its velocity is named ``<name>_dot``.
@@ -294,6 +296,7 @@ class Coordinate(_Named):
         return sp.Symbol(f"{self.name}_dot", real=True)
 
 
+@checked_names
 @dataclass(frozen=True)
 class Input(_Named):
     """An actuator input u_i with its symmetric limit ``|u_i| ≤ limit``, (38).

@@ -23,6 +23,7 @@ from undertow.base import (
     a_kind,
     check_fields,
     checked,
+    checked_names,
     error_text,
     near,
     positive,
@@ -109,6 +110,7 @@ _REMEDIES = {
 }
 
 
+@checked_names
 @dataclass(frozen=True)
 class Constraint:
     """A path constraint w(x, u) ≤ 0, equation (25).
@@ -329,6 +331,7 @@ def _warn_of_degrees(mechanism: Mechanism, state: str, most: float) -> None:
         )
 
 
+@checked_names
 @dataclass(frozen=True, repr=False)
 class Objective:
     """A stage cost with its horizon, terminal set and constraints.
@@ -787,6 +790,7 @@ def _one(_v: Names) -> sp.Expr:
     return sp.Integer(1)
 
 
+@checked_names
 @dataclass(frozen=True, repr=False)
 class MinimumEnergy(Objective):
     """Minimum control energy ∫ uᵀu dt, (40), plus optional state weights.
@@ -831,6 +835,7 @@ class MinimumEnergy(Objective):
         return f"∫ (uᵀu + {weight:g} xᵀx) dt" if weight else "∫ uᵀu dt"
 
 
+@checked_names
 @dataclass(frozen=True, repr=False)
 class MinimumTime(Objective):
     """Minimum time to the terminal set, ∫ 1 dt = t_f, (29) and (41)."""

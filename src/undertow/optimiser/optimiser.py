@@ -12,7 +12,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from undertow.base import InvalidInputError, at_least, between, check_fields, checked
+from undertow.base import InvalidInputError, at_least, between, check_fields, checked, checked_names
 from undertow.closed_loop import ClosedLoop
 from undertow.law import (
     Plan,
@@ -67,6 +67,7 @@ class Planner(Protocol):
         ...
 
 
+@checked_names
 @dataclass(frozen=True, eq=False)
 class Optimiser:
     """Selects the plan that minimises the predicted cost of a closed loop.

@@ -8,7 +8,13 @@ from typing import Literal
 
 import numpy as np
 
-from undertow.base import InfeasibleError, InvalidInputError, SingularSurfaceError, check_fields
+from undertow.base import (
+    InfeasibleError,
+    InvalidInputError,
+    SingularSurfaceError,
+    check_fields,
+    checked_names,
+)
 from undertow.closed_loop import ClosedLoop, Event
 from undertow.law import Margin, Plan, Surface, surface_margins
 from undertow.models import FloatArray, Mechanism, in_degrees
@@ -23,6 +29,7 @@ LARGER_BUDGET = (
 )
 
 
+@checked_names
 @dataclass(frozen=True)
 class Budget:
     """What one optimisation may spend; it returns its best answer when either is used up.

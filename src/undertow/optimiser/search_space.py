@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from undertow.base import InvalidInputError, check_fields, checked, positive, require
+from undertow.base import InvalidInputError, check_fields, checked, checked_names, positive, require
 from undertow.closed_loop import ClosedLoop, RolloutBuffers
 from undertow.closed_loop.trajectory import Batch
 from undertow.law import LawLayout, Plan, ReachingLaw, Surface, rising_from_zero
@@ -29,6 +29,7 @@ from undertow.symbolic import compiled
 SLOWEST, FASTER = 1.0, 2.0
 
 
+@checked_names
 @dataclass(frozen=True)
 class DecisionVariables:
     """What may be chosen besides the paper's surface parameters λ_a, α_u, λ_u.

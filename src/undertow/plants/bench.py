@@ -14,7 +14,16 @@ from typing import Any, Self
 
 import numpy as np
 
-from undertow.base import InvalidInputError, ReadOnly, at_least, between, one_of, positive, require
+from undertow.base import (
+    InvalidInputError,
+    ReadOnly,
+    at_least,
+    between,
+    checked_names,
+    one_of,
+    positive,
+    require,
+)
 from undertow.mechanisms import rotary_pendulum
 from undertow.models import FloatArray, Mechanism, Parameter
 
@@ -25,6 +34,7 @@ def _at_least_zero(what: str, owner: Any, names: Iterable[str], *, infinite: boo
         positive(f"{name} of {what}", value, "0 turns it off", zero=True, infinite=infinite)
 
 
+@checked_names
 @dataclass(frozen=True)
 class Friction:
     """Friction of a joint: Coulomb, breakaway (Stribeck's curve), viscous.
@@ -66,6 +76,7 @@ class Friction:
         return self.coulomb if self.breakaway is None else self.breakaway
 
 
+@checked_names
 @dataclass(frozen=True)
 class Encoder:
     """A position sensor.
@@ -90,6 +101,7 @@ class Encoder:
         _at_least_zero("an encoder", self, ("resolution", "noise"))
 
 
+@checked_names
 @dataclass(frozen=True)
 class Amplifier:
     """What stands between the number written and what drives the joint.
@@ -120,6 +132,7 @@ class Amplifier:
         _at_least_zero("an amplifier", self, ("limit",), infinite=True)
 
 
+@checked_names
 @dataclass(frozen=True)
 class Backlash:
     """Play between motor and joint.
@@ -152,6 +165,7 @@ class Backlash:
         )
 
 
+@checked_names
 @dataclass(frozen=True)
 class Push:
     """A knock: an impulse on one coordinate.
@@ -171,6 +185,7 @@ class Push:
     impulse: float
 
 
+@checked_names
 @dataclass(frozen=True)
 class Timing:
     """When things happen.
@@ -216,6 +231,7 @@ class Timing:
         return self.period / self.steps
 
 
+@checked_names
 @dataclass(frozen=True)
 class Bench:
     """A mechanism with everything that its model leaves out.

@@ -29,7 +29,7 @@ from typing import Literal
 
 import numpy as np
 
-from undertow.base.arguments import at_least, require
+from undertow.base.arguments import at_least, checked_names, require
 from undertow.base.verdict import Verdict
 from undertow.closed_loop.gate import Admission, Gate, cost_gate
 from undertow.closed_loop.rollout import ClosedLoop
@@ -45,6 +45,7 @@ FIRST_LOOK = 1.0
 _KINDS: tuple[Evidence, ...] = ("region", "dual", "sampled", "local")
 
 
+@checked_names
 @dataclass(frozen=True)
 class GatePolicy:
     """Which evidence is accepted for a new surface at the present state, with what margins.

@@ -11,7 +11,15 @@ from typing import Any, Literal, Self, get_args
 
 import numpy as np
 
-from undertow.base import InvalidInputError, UndertowError, a_kind, check_fields, one_of, positive
+from undertow.base import (
+    InvalidInputError,
+    UndertowError,
+    a_kind,
+    check_fields,
+    checked_names,
+    one_of,
+    positive,
+)
 from undertow.cascade import Cascade, CascadeState, Legs, derate_actuator
 from undertow.cascade.swing_up import CatchRegion, SwingUpAndCatch, designed, hanging
 from undertow.estimators import Belief, Estimator, MakeEstimator
@@ -59,6 +67,7 @@ OLD_SETTINGS = {
 }  # fmt: skip
 
 
+@checked_names
 @dataclass(frozen=True)
 class Recipe:
     """How to build cascade, estimator, controller and simulated rig of a run.

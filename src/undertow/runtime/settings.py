@@ -7,11 +7,12 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from undertow.base import check_fields, positive
+from undertow.base import check_fields, checked_names, positive
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import TRAVEL, Objective, state_box
 
 
+@checked_names
 @dataclass(frozen=True)
 class Settings:
     """Limits and timeouts of the fast loop.

@@ -24,6 +24,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import ArrayLike
 
+from undertow.base.arguments import checked_names
 from undertow.base.errors import InvalidInputError
 from undertow.base.verdict import Verdict, inward
 from undertow.law import ReachingLaw, Surface, check_surface_shape
@@ -42,6 +43,7 @@ from undertow.proofs.kernel import claims as kernel
 from undertow.proofs.kernel.model import Law, Model
 
 
+@checked_names
 @dataclass(frozen=True)
 class DisturbanceBound:
     """The largest disturbance on one coordinate, alone, that K still overcomes.
