@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from undertow.symbolic import compiled, load_module
-from undertow.symbolic.compiler import UNSUITED, Straight
+from undertow.symbolic.compiler import UNSUITED
 
 HEAD = """import math
 import numpy as np
-from undertow.symbolic.compiler import Straight, brief, compiled
+from undertow.symbolic.compiler import brief, compiled
 from undertow.symbolic.primitives import select
 
 TABLE = np.array([[0.5, -1.25], [3.0, 0.1]])
@@ -196,8 +196,7 @@ def test_random_programs_give_the_bits_that_numba_gives(seed: int) -> None:
     except numba.core.errors.NumbaError:
         pytest.skip("numba refuses it")
     before = len(UNSUITED)
-    for decorator in (compiled, lambda **_: compiled(pipeline_class=Straight)):
-        assert _bits(decorator(cache=False)(plain)) == expected, source  # type: ignore[no-untyped-call]
+    assert _bits(compiled(cache=False)(plain)) == expected, source
     assert UNSUITED[before:] == [], source
 
 

@@ -60,7 +60,7 @@ def test_memory_holds_numbers_until_a_function_returns() -> None:
     source = f"""import numba
 {PRIMITIVES}
 
-@numba.njit(pipeline_class=Straight)
+@compiled(cache=False)
 def turned(x):
     first, second, total = memory(24), memory(3), 0.0
     for i in range(24):

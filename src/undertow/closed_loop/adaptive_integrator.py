@@ -27,7 +27,7 @@ import sympy as sp
 
 from undertow.closed_loop.trajectory import Event
 from undertow.closed_loop.work_array import LoopGraph
-from undertow.symbolic import PREAMBLE, PRIMITIVES, Emitter, Straight, compiled, docstring, numba
+from undertow.symbolic import PREAMBLE, PRIMITIVES, Emitter, compiled, docstring, numba
 
 #: Dormand and Prince: stages, the last of which is the step; its error; when each stage is.
 STAGES = np.array([
@@ -70,7 +70,7 @@ _ROW = numba.float64[::1]
 LOOK = numba.void(numba.float64, *[_ROW] * 8)
 _LOOK = f"numba.void(numba.float64, {', '.join(['numba.float64[::1]'] * 8)})"
 
-_inlined = compiled(forceinline=True, no_cpython_wrapper=True, pipeline_class=Straight)
+_inlined = compiled(forceinline=True, no_cpython_wrapper=True)
 
 
 @_inlined
@@ -344,7 +344,7 @@ def follow() -> Any:
         look, look, whole, table, _ROW, block, numba.int64[::1], _ROW, _ROW, _ROW, block, real,
         real, real, whole, _ROW, *[real] * 5, _ROW, whole, block, table,
     )  # fmt: skip
-    return compiled(signature, pipeline_class=Straight)(_follow)
+    return compiled(signature)(_follow)
 
 
 def look_source(program: LoopGraph, *, header: str) -> str:
@@ -400,8 +400,7 @@ def look_source(program: LoopGraph, *, header: str) -> str:
         "look": [*loads(flow_needs), *moved] if program.sampled else looked,
     }
     return f"{docstring(header)}{PREAMBLE}{PRIMITIVES}" + "".join(
-        f"\n\n@compiled({_LOOK}, no_cfunc_wrapper=False, pipeline_class=Straight, "
-        "fastmath={'contract', 'nsz', 'arcp'})\n"
+        f"\n\n@compiled({_LOOK}, no_cfunc_wrapper=False, fastmath={{'contract', 'nsz', 'arcp'}})\n"
         f"def {name}(t, x, lane, plant, belief, limits, u, seen, rates):\n"
         f"{textwrap.indent(chr(10).join(lines), '    ')}\n"
         for name, lines in functions.items()

@@ -433,7 +433,7 @@ def kernel_source(program: LoopGraph, *, header: str) -> str:
 import numpy as np
 {PRIMITIVES}
 
-@compiled(pipeline_class=Straight, fastmath={{"contract", "nsz", "arcp"}})
+@compiled(fastmath={{"contract", "nsz", "arcp"}})
 def rollout(
     from_lane, to_lane, x0, live, lanes, switch, plant, belief, limits, noise,
     start, h, steps, zoh_steps, terminal, escape, cap, seek, prices, calm_from, every, record, out,
@@ -492,7 +492,7 @@ def _etd_integrate(w: _Writer) -> str:
     """Return the function that ends rollouts in large steps, see :mod:`.exponential_integrator`."""
     return f"""
 
-@compiled(pipeline_class=Straight, fastmath={{"contract", "nsz", "arcp"}})
+@compiled(fastmath={{"contract", "nsz", "arcp"}})
 def etd_integrate(
     from_lane, to_lane, lanes, plant, belief, limits, until, terminal, escape, tail, counted,
     linear, value, powers, forced, reach, out,

@@ -57,9 +57,7 @@ def _source(N: int) -> str:
     return f'''"""Linear systems of order {N}; generated, do not edit."""
 
 {PRIMITIVES}
-inner = compiled(
-    no_cpython_wrapper=True, pipeline_class=Straight, fastmath={{"contract", "nsz", "arcp"}}
-)
+inner = compiled(no_cpython_wrapper=True, fastmath={{"contract", "nsz", "arcp"}})
 
 
 @inner
@@ -76,7 +74,7 @@ def _turned(a, b, add, o):
 {_indented(turned)}
 
 
-@compiled(pipeline_class=Straight)
+@compiled()
 def double(A, Q, P, stable, powers, forced):
     half = {N // 2}
     zero, one, scaled = memory({area}), memory({area}), memory({area})

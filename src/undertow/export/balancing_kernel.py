@@ -109,7 +109,7 @@ def _source(mechanism: Mechanism, stage: sp.Expr, margins: list[sp.Expr], header
 import numpy as np
 {PRIMITIVES}
 
-@compiled(pipeline_class=Straight, fastmath={{"contract", "nsz", "arcp"}})
+@compiled(fastmath={{"contract", "nsz", "arcp"}})
 def advance(x, u, t, cost, margin, plant, h, steps):
 {_lines(constants, 1)}
     weights, reaches, places = {table}

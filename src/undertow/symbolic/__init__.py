@@ -7,7 +7,7 @@ assignments with its linear algebra unrolled. The printers make code of it: :mod
 """
 
 from undertow.symbolic.c99 import C99Emitter, Real, literal
-from undertow.symbolic.compiler import PRIMITIVES, Straight, brief, compiled
+from undertow.symbolic.compiler import PRIMITIVES, brief, compiled
 from undertow.symbolic.expressions import parse_expression
 from undertow.symbolic.function import COMPILED, PREAMBLE, function_source, scalar_module
 from undertow.symbolic.machine import numba, processor
@@ -33,7 +33,6 @@ __all__ = [
     "C99Emitter",
     "Emitter",
     "Real",
-    "Straight",
     "Tape",
     "Workspace",
     "brief",

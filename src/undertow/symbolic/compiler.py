@@ -17,11 +17,11 @@ from numba.core import errors as numba_errors
 
 from undertow.symbolic.machine import numba
 
-__all__ = ["PRIMITIVES", "Straight", "brief", "compiled"]
+__all__ = ["PRIMITIVES", "brief", "compiled"]
 
 #: What a generated module imports beside :data:`.function.PREAMBLE`.
 PRIMITIVES = (
-    "from undertow.symbolic.compiler import Straight, compiled\n"
+    "from undertow.symbolic.compiler import compiled\n"
     "from undertow.symbolic.primitives import memory, select\n"
 )
 
@@ -34,7 +34,7 @@ errors: Any = numba_errors
 UNSUITED: list[str] = []
 
 
-class Usual(compiler.Compiler):  # type: ignore[misc]
+class Compiler(compiler.Compiler):  # type: ignore[misc]
     """numba's compiler of functions whose plain lines are parts."""
 
     def compile_extra(self, function: Any) -> Any:
@@ -66,20 +66,6 @@ class Usual(compiler.Compiler):  # type: ignore[misc]
                 part.leave(self.state.targetctx)
 
 
-class Straight(Usual):
-    """Without what looks for closures and sums of whole arrays: there are none."""
-
-    LEFT_OUT = "InlineClosureLikes", "GenericRewrites", "NopythonRewrites"
-
-    def define_pipelines(self) -> list[Any]:
-        """Return the one list of its passes."""
-        usual = compiler.DefaultPassBuilder.define_nopython_pipeline(self.state).passes
-        passes = compiler.PassManager("straight")
-        passes.passes = [each for each in usual if each[0].__name__ not in self.LEFT_OUT]
-        passes.finalize()
-        return [passes]
-
-
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
@@ -89,7 +75,7 @@ def compiled(*signature: Any, **options: Any) -> Any:
     Nor are there exceptions: arithmetic is NumPy's. ``*signature``: types of the arguments, for
     a function that is compiled when it is defined. ``**options``: numba's.
     """
-    usual = {"cache": True, "nogil": True, "no_cfunc_wrapper": True, "pipeline_class": Usual}
+    usual = {"cache": True, "nogil": True, "no_cfunc_wrapper": True, "pipeline_class": Compiler}
     return numba.njit(*signature, error_model="numpy", **{**usual, **options})
 
 

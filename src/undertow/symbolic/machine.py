@@ -15,8 +15,7 @@ second and 25 MB; machine code needs its runtime alone, and here gets no more.
 
 What numba builds while it compiles is there until the end: looking for garbage in it would take a
 tenth of the time.  So would functions for callers in C, which :data:`~.compiler.compiled` leaves
-out, and finding again and again what type a sum of two numbers has would take more.  All of this is
-for functions of this package alone; other people's are compiled as ever.
+out.  All of this is for functions of this package alone; other people's are compiled as ever.
 """
 
 from __future__ import annotations
@@ -35,7 +34,6 @@ import numba
 from numba.core import caching as numba_caching
 from numba.core import event as numba_event
 from numba.core.runtime.nrt import rtsys
-from numba.core.types import functions as numba_functions
 
 from undertow.symbolic.private import is_private, private_folder
 
@@ -45,7 +43,6 @@ PACKAGE = Path(__file__).resolve().parent.parent
 
 #: numba's own modules have no types.
 caching: Any = numba_caching
-functions: Any = numba_functions
 event: Any = numba_event
 
 
@@ -157,7 +154,7 @@ def _saving(usual: Any) -> Any:
 
 
 class _Sooner(event.Listener):  # type: ignore[misc]
-    """While a function of ours is compiled: no collection of garbage, and types are remembered."""
+    """While a function of ours is compiled there is no collection of garbage."""
 
     def __init__(self) -> None:
         self._inside: list[bool] = []
@@ -168,36 +165,14 @@ class _Sooner(event.Listener):  # type: ignore[misc]
         if ours and not any(self._inside):
             self._collects = gc.isenabled()
             gc.disable()
-            functions.BaseFunction.get_call_type = _remembering(_USUAL)
         self._inside.append(ours)
 
     def on_end(self, event: Any) -> None:
-        if self._inside.pop() and not any(self._inside):
-            functions.BaseFunction.get_call_type = _USUAL
-            if self._collects:
-                gc.enable()
-
-
-def _remembering(usual: Any) -> Any:
-    """Return how numba types a call, for operators with what it found the last time.
-
-    It types all that a function holds until nothing changes any more, three times or more.
-    A function type never changes: where overloads are added, there is a new one.
-    """
-
-    def get_call_type(function: Any, context: Any, args: Any, kws: Any) -> Any:
-        if kws or getattr(function.typing_key, "__module__", "") != "_operator":
-            return usual(function, context, args, kws)
-        known = vars(function).setdefault("_known", {})
-        if args not in known:
-            known[args] = usual(function, context, args, kws)
-        return known[args]
-
-    return get_call_type
+        if self._inside.pop() and not any(self._inside) and self._collects:
+            gc.enable()
 
 
 _widen()
-_USUAL = functions.BaseFunction.get_call_type
 event.register("numba:compile", _Sooner())
 caching.Cache.load_overload = _loading(caching.Cache.load_overload)
 caching.Cache.save_overload = _saving(caching.Cache.save_overload)
