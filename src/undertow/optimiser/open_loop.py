@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from undertow.closed_loop import Trajectory
 from undertow.models import FloatArray, Mechanism
@@ -282,6 +281,8 @@ class _Program:
         end: FloatArray,
         scale: FloatArray,
     ) -> None:
+        from scipy import sparse  # slow to import
+
         self.states, self.inputs = len(low), len(used)
         self.used, self.low, self.high, self.end, self.scale = used, low, high, end, scale
         states, inputs, count = self.states, self.inputs, self.states * NODES
@@ -324,7 +325,8 @@ class _Program:
         The end stays within a box of ``radius`` and on the near side of the cuts, directions (2n,):
         tangents to the terminal ball where earlier steps left it.
         """
-        from scipy.optimize import linprog  # slow to import
+        from scipy import sparse  # slow to import
+        from scipy.optimize import linprog
 
         low = np.maximum(np.minimum(self.low[:, 1:], 0.0), -trust)
         high = np.minimum(np.maximum(self.high[:, 1:], 0.0), trust)
