@@ -8,6 +8,7 @@ import re
 import sqlite3
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.console import Console
 from typer.testing import CliRunner
@@ -75,6 +76,8 @@ def test_a_run_is_logged_and_its_replay_is_identical(tmp_path: Path) -> None:
         (("run", "rotary_pendulum", "--rig", "real"), "FILE.py:NAME"),
         (("run", "rotary_pendulum", "--delay", "0.002"), "on an ideal rig"),
         (("run", "rotary_pendulum", "--rig", "realistic", "--delay", "-1"), "≥ 0"),
+        (("run", "rotary_pendulum", "--limit", "voltage=20"), "20 V, must be 0 V to 15 V"),
+        (("run", "rotary_pendulum", "--limit", "volt=5"), "one of voltage"),
     ],
 )
 def test_bad_words_are_refused_in_one_line(words: tuple[str, ...], value: str) -> None:
@@ -356,3 +359,13 @@ def test_a_missing_log_is_refused(tmp_path: Path) -> None:
     code, _, err = run("replay", str(tmp_path / "none.db"))
     assert code == 1
     assert "no such file" in err
+
+
+@pytest.mark.slow
+def test_a_run_keeps_to_a_limit_of_the_output(tmp_path: Path) -> None:
+    """Also where the mechanism allows more; its replay knows it."""
+    log = tmp_path / "run.db"
+    words = ("--start", "phi=15deg", "--seconds", "0.3", "--simulated", "--log", str(log))
+    assert run("run", "rotary_pendulum", "--limit", "voltage=4", *words)[0] in (0, 3)
+    assert np.abs(read_log(log)["voltage"]).max() == 4.0
+    assert run("replay", str(log))[0] == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import json
 import math
 import time
 from dataclasses import replace
@@ -255,6 +256,18 @@ def test_a_limit_of_the_output_leaves_the_objective_as_it_is() -> None:
     again = Recipe.from_dict(written.as_dict())
     assert again.belief.fingerprint == recipe.belief.fingerprint
     assert again.cascade.objective == recipe.cascade.objective == cascade.objective
+
+
+def test_each_input_may_have_a_limit_of_its_own() -> None:
+    """Through a log's words, too; one for each, or one for all."""
+    arm = ut.mechanisms.two_motor_three_link()
+    recipe = Recipe("two_motor_three_link", settings=Settings(output_limit=(12.0, 40.0)))
+    again = Recipe.from_dict(json.loads(json.dumps(recipe.as_dict())))
+    assert again.settings == recipe.settings
+    assert again.settings.limits(arm).tolist() == [12.0, 20.0]
+    assert Settings(output_limit=25.0).limits(arm).tolist() == [25.0, 20.0]
+    with pytest.raises(InvalidInputError, match=r"output_limit: .*one number or 2"):
+        Settings(output_limit=(1.0, 2.0, 3.0)).limits(arm)
 
 
 @pytest.mark.parametrize("designed", [False, True])

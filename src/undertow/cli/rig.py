@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal, cast
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 import typer
 from rich.console import RenderableType
 
-from undertow.base import printable
+from undertow.base import between, printable
 from undertow.cascade import problem_words
 from undertow.cli import options
 from undertow.cli.parsing import (
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
 @command(
     "undertow run rotary_pendulum --seconds 60 --lead 0.02",
     "undertow run rotary_pendulum --rig realistic --start phi=30deg --log bench.db",
+    "undertow run rotary_pendulum --rig realistic --limit voltage=5",
     "undertow run cart_pendulum --simulated --seconds 10 --log run.db",
     "undertow run overhead_crane --target x=0.5m --target x=-0.5m@8s --seconds 16",
     "undertow run rotary_pendulum --target theta=20deg@0.25Hz --seconds 20",
@@ -69,6 +71,7 @@ def run(
     objective: options.Goal = USUAL,
     swing_up: bool = False,
     setting: options.Settings = None,
+    limit: options.Limits = None,
     known: Annotated[Literal["usual", "exact"], typer.Option("--belief")] = "usual",
     period: float = 0.001,
     delay: float | None = None,
@@ -137,6 +140,13 @@ def run(
 
     name, target = aimed(name, target)
     belief = mechanism_named(name, setting)
+    settings = Settings(lead_time=lead)
+    if limit:
+        limits = mechanism_named(name, setting, limit).input_limits.tolist()
+        for channel, most in zip(belief.inputs, limits, strict=True):
+            what = f"limit of input '{channel.name}'"
+            between(what, most, 0.0, channel.limit, channel.unit, "A rig gets no more than its own")
+        settings = replace(settings, output_limit=tuple(limits))
     hanging = swing_up and not start
     goal = parse_target(belief, target)
     recipe = Recipe(
@@ -153,7 +163,7 @@ def run(
         period=period,
         delay=delay,
         seconds=float("inf") if simulated else max(0.01, 0.3 * lead),
-        settings=Settings(lead_time=lead),
+        settings=settings,
     )
     if supervisor is None:
         supervisor = in_a_file(rig) and not simulated and hasattr(os, "fork")

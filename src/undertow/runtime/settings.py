@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from undertow.base import check_fields, checked_names, positive
+from undertow.base import check_fields, checked_names, one_for_each, positive
 from undertow.models import FloatArray, Mechanism
 from undertow.objective import TRAVEL, Objective, state_box
 
@@ -20,8 +20,8 @@ class Settings:
     Parameters
     ----------
     output_limit
-        Largest |u|, in the input's unit; the mechanism's own limits apply besides.  Plans keep to
-        the smaller of the two.
+        Largest |u|, in the input's unit, for all inputs or one for each; the mechanism's own
+        limits apply besides.  Plans keep to the smaller of the two.
     slew_time
         Shortest time in which an input may cross its whole range, s: the slew rate is
         2 u_max / slew_time.  Inputs without a limit have none on their rate either.
@@ -81,7 +81,7 @@ class Settings:
         it has settled, s, it is converging and may be four times as far away.
     """
 
-    output_limit: float = math.inf
+    output_limit: float | tuple[float, ...] = math.inf
     slew_time: float = 0.004
     lead_time: float = 0.1
     max_lead_time: float = 0.5
@@ -118,8 +118,12 @@ class Settings:
             )
 
     def limits(self, mechanism: Mechanism) -> FloatArray:
-        """Largest |u_i|, (m,)."""
-        return np.minimum(mechanism.input_limits, self.output_limit)
+        """Largest |u_i|, (m,).
+
+        Raises InvalidInputError where there is not one ``output_limit`` for each input.
+        """
+        most = one_for_each("output_limit", self.output_limit, mechanism.m, infinite=True)
+        return np.minimum(mechanism.input_limits, most)
 
     def bounded(self, objective: Objective, mechanism: Mechanism) -> Objective:
         """Return an objective whose motions keep to ``max_travel``, where that is less than ranges.
