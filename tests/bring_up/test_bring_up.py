@@ -510,7 +510,7 @@ class Dies(Driver):
             raise RuntimeError("bus error")
         super().write(u)
 
-class Clings(Driver):
+class Clings(Gaps):
     def close(self):
         raise RuntimeError("busy")
 """
@@ -520,7 +520,7 @@ class Clings(Driver):
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("Gaps", "Wrong: input sign of voltage"),
+        pytest.param("Gaps", "Wrong: input sign of voltage", marks=pytest.mark.slow),
         ("Lost", "error: reading of coordinate 1 of the rig: got no number"),
         ("Dies", "error: write() of the rig: got RuntimeError: bus error, "),
         ("Clings", "Wrong: input sign of voltage"),

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import undertow as ut
+from runs import short_searches
 from undertow.base import ArtefactError, InvalidInputError
 from undertow.estimators import (
     Estimator,
@@ -369,6 +370,7 @@ class _AlphaBeta(Estimator):
     noise_covariance = steady_covariance
 
 
+@short_searches()
 def test_an_estimator_of_ones_own_runs_on_a_rig_end_to_end(
     arm: ut.Mechanism, tmp_path: Path
 ) -> None:
