@@ -449,7 +449,7 @@ from undertow.cascade.swing_up import hanging
 class Driver:
     def __init__(self):
         # A pendulum in grease: it is soon at rest after a push, and the wizard waits for that.
-        thick = srv02_rig().friction | {"phi": Friction(0.0002, 0.0003, 0.05, viscous=0.003)}
+        thick = srv02_rig().friction | {"phi": Friction(0.0002, 0.0003, 0.05, viscous=0.01)}
         bench = replace(srv02_rig(), friction=thick)
         self.rig = RealisticRig(bench, hanging(bench.mechanism), seed=3)
         self.period = self.rig.period
