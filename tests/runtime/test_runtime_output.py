@@ -420,7 +420,7 @@ def test_deadlines_missed_beyond_a_share_of_a_second_stop_the_run(
     with Log(tmp_path / "run.db", Columns.of(RECIPE.belief), meta, threaded=False) as book:
         worker = InlineWorker(RECIPE.respond)
         runtime = Runtime(controller, device, worker, clock=clock, log=book)
-        report = runtime.run(1.0)
+        report = runtime.run(1.5)
     verdict = report.verdict
     if stops:
         assert report.stopped_by.startswith("deadlines missed in 30% of the last second")
