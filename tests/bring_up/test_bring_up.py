@@ -449,7 +449,7 @@ from undertow.cascade.swing_up import hanging
 class Driver:
     def __init__(self):
         # A pendulum in grease: it is soon at rest after a push, and the wizard waits for that.
-        thick = srv02_rig().friction | {"phi": Friction(0.0002, 0.0003, 0.05, viscous=0.003)}
+        thick = srv02_rig().friction | {"phi": Friction(0.0002, 0.0003, 0.05, viscous=0.01)}
         bench = replace(srv02_rig(), friction=thick)
         self.rig = RealisticRig(bench, hanging(bench.mechanism), seed=3)
         self.period = self.rig.period
@@ -510,7 +510,7 @@ class Dies(Driver):
             raise RuntimeError("bus error")
         super().write(u)
 
-class Clings(Driver):
+class Clings(Gaps):
     def close(self):
         raise RuntimeError("busy")
 """
@@ -520,7 +520,7 @@ class Clings(Driver):
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("Gaps", "Wrong: input sign of voltage"),
+        pytest.param("Gaps", "Wrong: input sign of voltage", marks=pytest.mark.slow),
         ("Lost", "error: reading of coordinate 1 of the rig: got no number"),
         ("Dies", "error: write() of the rig: got RuntimeError: bus error, "),
         ("Clings", "Wrong: input sign of voltage"),

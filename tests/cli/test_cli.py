@@ -25,7 +25,7 @@ import typer
 from typer.main import get_command
 
 import undertow as ut
-from runs import run
+from runs import run, short_searches
 from support import rest_slow
 from undertow.base import ArtefactError, InvalidInputError, table, write_file
 from undertow.cli import _ORDER, _place, app, main, terminal
@@ -302,6 +302,7 @@ def test_a_schedule_goes_with_either_belief(
     assert err == f"error: {belief}, 0.1 s.\n"
 
 
+@short_searches()
 def test_a_target_on_the_command_line() -> None:
     """Set-points one after another; the report says which, and what was reached."""
     short = ("--objective", "time", "--start", "phi=0deg", "--belief", "exact")

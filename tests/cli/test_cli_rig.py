@@ -14,6 +14,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 import undertow as ut
+from runs import short_searches
 from support import rest_slow
 from undertow.cli import app
 from undertow.runtime import read_log
@@ -155,6 +156,7 @@ class Arm(IdealRig):
 """
 
 
+@short_searches()
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="a supervisor is a forked process")
 @pytest.mark.parametrize("supervisor", rest_slow([None, "--no-supervisor"], None))
 def test_a_rig_of_ones_own_is_kept_by_another_process_unless_told_otherwise(
@@ -200,6 +202,7 @@ class Arm(IdealRig):
 """
 
 
+@short_searches()
 def test_who_has_reversed_encoders_is_shown_the_way_to_the_bench(tmp_path: Path) -> None:
     """Lost at once, where the law is singular: the run knows the place, the bench the reason."""
     (tmp_path / "arm.py").write_text(REVERSED)
@@ -233,6 +236,7 @@ class Arm(IdealRig):
 """
 
 
+@short_searches()
 @pytest.mark.parametrize(
     ("step", "code"),
     [("150", 5), pytest.param("150 or self.count > 150", 7, marks=pytest.mark.slow)],

@@ -26,8 +26,8 @@ from undertow.plants.scenes import mujoco_scene
 from undertow.studies import gallery
 
 NAMES = sorted(LIBRARY)
-#: One for each kind of figure: a rope, links in a row, a wheel, two motors.
-SOME = {"gantry_crane", "acrobot", "reaction_wheel_pendulum", "two_motor_three_link"}
+#: A rope, and a link with a wheel.
+SOME = {"gantry_crane", "reaction_wheel_pendulum"}
 
 
 def motion(mechanism: ut.Mechanism, seconds: float = 1.0) -> ut.Trajectory:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import undertow as ut
+from runs import short_searches
 from undertow.base import InvalidInputError
 from undertow.display.live import Message
 from undertow.display.sketches import sketch
@@ -162,7 +163,7 @@ def test_the_ensemble_closes_in_on_what_moves() -> None:
 
 
 @pytest.fixture
-def looked_at() -> tuple[Simulation, Now, Now]:
+def looked_at() -> Iterator[tuple[Simulation, Now, Now]]:
     bounds = Now(lambda asked: {"kind": "bound", "t": asked.t, "cost": 1.0, "why": "",
                                 "times": [asked.t], "left": [1.0]})  # fmt: skip
     maps = Now(MAPS)
@@ -170,7 +171,8 @@ def looked_at() -> tuple[Simulation, Now, Now]:
         RIG, sketch(RIG), worker=InlineWorker(COMPUTE, latency=0.0), beside=Beside(bounds, maps)
     )
     made.ready.result(120)
-    return made, bounds, maps
+    with short_searches():
+        yield made, bounds, maps
 
 
 def go(simulation: Simulation, seconds: float) -> list[Message]:

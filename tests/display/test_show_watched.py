@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from runs import RECIPE, run
+from runs import RECIPE, run, short_searches
 from undertow.base import ArtefactError, InvalidInputError
 from undertow.display.live import Message
 from undertow.display.live.page import encoded
@@ -34,7 +34,8 @@ COLUMNS = Columns.of(RECIPE.belief)
 
 @pytest.fixture(scope="module")
 def meta() -> dict[str, object]:
-    return about(RECIPE.make_controller(RECIPE.first()), RECIPE)
+    with short_searches():
+        return about(RECIPE.make_controller(RECIPE.first()), RECIPE)
 
 
 def write(book: Log, first: int, count: int) -> None:
@@ -111,6 +112,7 @@ def frames(messages: list[Message]) -> list[Message]:
     return [one for one in messages if one["kind"] == "frame"]
 
 
+@short_searches()
 def test_a_run_is_shown_while_it_goes_on_and_then_recorded(
     tmp_path: Path, meta: dict[str, object]
 ) -> None:

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import undertow as ut
+from runs import short_searches
 from undertow.base import ArtefactError, InvalidInputError
 from undertow.estimators import (
     Estimator,
@@ -369,6 +370,7 @@ class _AlphaBeta(Estimator):
     noise_covariance = steady_covariance
 
 
+@short_searches()
 def test_an_estimator_of_ones_own_runs_on_a_rig_end_to_end(
     arm: ut.Mechanism, tmp_path: Path
 ) -> None:
@@ -381,7 +383,7 @@ def test_an_estimator_of_ones_own_runs_on_a_rig_end_to_end(
 
     cascade = ut.Cascade(arm, ut.objective_for(arm, "bench-energy"))
     rig, log = IdealRig(arm, arm.state(phi=0.2), PERIOD), tmp_path / "run.db"
-    report = ut.run(cascade, rig, seconds=1.5, log=log, simulated=True, estimator=make, phi=0.2)
+    report = ut.run(cascade, rig, seconds=1.2, log=log, simulated=True, estimator=make, phi=0.2)
     assert str(report.verdict).startswith("balanced")
     assert max(one.calls for one in made if hasattr(one, "calls")) > 1000
     assert report.answers["applied"] > 5

@@ -147,13 +147,13 @@ def test_at_rest_nothing_is_learnt_and_a_reset_forgets(arm: Mechanism) -> None:
 
 
 def test_noise_of_the_estimate_at_rest(arm: Mechanism) -> None:
-    """Predicted from the filter's gain, and sampled from 60 s of white noise; with a delay too."""
+    """Predicted from the filter's gain, and sampled from 30 s of white noise; with a delay too."""
     for delay in (0.0, 0.003):
         kalman = KalmanFilter(arm, PERIOD, position_noise=NOISE, disturbance_drift=0.5, delay=delay)
         kalman.reset(np.zeros(4))
         law, rng = np.zeros(1), np.random.default_rng(7)
         rows = []
-        for k in range(60_000):
+        for k in range(30_000):
             seen = Measurement(k * PERIOD, NOISE * rng.standard_normal(2))
             rows.append(kalman.estimate(seen, law).copy())
         sampled = np.cov(np.array(rows[1000:]).T)
@@ -207,13 +207,14 @@ def _knocked(
     rng, kalman, u = np.random.default_rng(6), _learning(arm, disturbance_drift=1.5), np.zeros(1)
     law, x = InnerLoop(arm, ut.first_surface(arm)), arm.state(phi=0.3)
     kalman.reset(x)
+    rig = IdealRig(arm, x, PERIOD)
     before, off = np.empty(0), np.empty(0)
     for k in range(600):
         if k == 400:
             assert kalman.learnt is not None
             before = kalman.learnt.offset
             x = x + np.array([0.0, 0.0, 0.4 * knock, knock])
-        rig = IdealRig(arm, x, PERIOD)
+            rig = IdealRig(arm, x, PERIOD)
         q = x[:2] + NOISE * rng.standard_normal(2) + (0.03 if k == bad else 0.0)
         estimate = kalman.estimate(Measurement(k * PERIOD, q), u)
         if k == 405:

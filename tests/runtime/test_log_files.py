@@ -26,7 +26,9 @@ RIG = ut.mechanisms.rotary_pendulum()
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """A short run with an answer in it."""
     log = tmp_path_factory.mktemp("log") / "run.db"
-    cascade = ut.Cascade(RIG, ut.objective_for(RIG, "bench-energy"), warm=ut.Budget(64))
+    cascade = ut.Cascade(
+        RIG, ut.objective_for(RIG, "bench-energy"), cold=ut.Budget(512), warm=ut.Budget(64)
+    )
     rig = IdealRig(RIG, RIG.state(phi=0.2), 0.001)
     ut.run(cascade, rig, seconds=0.3, log=log, simulated=True, phi=0.2)
     return read_log(log)

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import undertow as ut
-from runs import run_until
+from runs import run_until, short_searches
 from undertow.base import ArtefactError, InvalidInputError
 from undertow.cascade import CascadeState
 from undertow.law import ReferenceMotion
@@ -48,7 +48,8 @@ RECIPE = Recipe(start=(0.0, 0.2, 0.0, 0.0), evaluations=64)
 def begun() -> tuple[Recipe, CascadeState]:
     """A recipe, and what its cascade starts with."""
     recipe = Recipe(start=(0.0, 0.05, 0.0, 0.0), evaluations=32)
-    return recipe, recipe.first()
+    with short_searches():
+        return recipe, recipe.first()
 
 
 def run_and_ask(
@@ -73,20 +74,21 @@ def of_target(report: Report) -> list[tuple[float, str]]:
     return [(round(t, 3), text) for t, what, text in report.events if what == "target"]
 
 
+@short_searches()
 def test_a_run_is_given_another_target_and_replayed_to_the_same_bits(tmp_path: Path) -> None:
     """Asked for twice: the second takes the first's place before there is a plan for that."""
     log, found = tmp_path / "run.db", []
     orders: dict[int, Callable[[Runtime], object]] = {
-        600: lambda run: run.retarget({"theta": 1.0}),
-        900: lambda run: found.append(run.retarget({"theta": -0.4})),
-        2500: lambda run: found.append(run.target),
+        300: lambda run: run.retarget({"theta": 1.0}),
+        500: lambda run: found.append(run.retarget({"theta": -0.4})),
+        2000: lambda run: found.append(run.target),
     }
-    report = run_and_ask(RECIPE, 3.5, orders, log)
+    report = run_and_ask(begun()[0], 3.4, orders, log)
     assert report.verdict.ending == "balanced"
     assert of_target(report) == [
-        (0.6, "asked for at 0.6 s: theta = 1"),
-        (0.9, "asked for at 0.9 s: theta = -0.4"),
-        (1.9, "jumps, asked for at 0.9 s"),
+        (0.3, "asked for at 0.3 s: theta = 1"),
+        (0.5, "asked for at 0.5 s: theta = -0.4"),
+        (1.5, "jumps, asked for at 0.5 s"),
     ]
     asked, reached = found
     assert asked.now == {}
@@ -98,7 +100,7 @@ def test_a_run_is_given_another_target_and_replayed_to_the_same_bits(tmp_path: P
     assert again.misjudged == 0
     assert abs(again.recording["theta"][-1] + 0.4) < 0.1
     (told, _) = [one for one in again.recording.events if one[2] == "set-points"]
-    assert told[:2] == (600, 0.6)
+    assert told[:2] == (300, 0.3)
 
 
 @pytest.mark.slow
@@ -135,6 +137,7 @@ def test_a_swing_up_with_set_points_catches_at_0_and_goes_there(tmp_path: Path) 
     assert abs(again.recording["theta"][late].mean() + 0.3) < 0.15
 
 
+@short_searches()
 def test_thrown_out_the_target_is_asked_for_again() -> None:
     """What catches does so at x = 0: the target that was in force is ahead once more."""
     recipe = Recipe(swing_up=True, evaluations=32)
@@ -181,6 +184,7 @@ def test_where_there_is_no_plan_the_target_stays_and_the_run_goes_on(
 HERE, ELSEWHERE = (ReferenceMotion.at_rest(np.array([q, 0.0])) for q in (0.3, 0.4))
 
 
+@short_searches()
 @pytest.mark.parametrize(
     ("asked", "jump", "target"),
     [
@@ -286,10 +290,11 @@ def test_what_was_asked_for_is_written_to_the_bit() -> None:
         assert np.array_equal(a.q, b.q)
 
 
-def test_a_step_takes_a_target_with_the_lockstep_check(memory: object) -> None:
+def test_a_step_takes_a_target_with_the_lockstep_check() -> None:
     """Inputs hold it, so that a step that is made twice is made with it."""
     legs = ((0.0, ReferenceMotion.at_rest(np.array([0.5, 0.0]))),)
-    controller = RECIPE.make_controller(RECIPE.first())
+    recipe, start = begun()
+    controller = recipe.make_controller(start)
     controller.step(Inputs(0.0, None, target=legs))
     assert controller.ahead == legs
     assert controller.aim.tolist() == [0.5, 0.0]

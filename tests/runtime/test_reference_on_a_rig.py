@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import undertow as ut
-from runs import run, run_until
+from runs import run, run_until, short_searches
 from undertow.base import InvalidInputError
 from undertow.cascade import CascadeState
 from undertow.law import ReferenceMotion
@@ -30,7 +30,8 @@ def motion() -> ReferenceMotion:
 @cache
 def first() -> CascadeState:
     """What a run begins with."""
-    return RECIPE.first()
+    with short_searches():
+        return RECIPE.first()
 
 
 def off(log: Path, after: float) -> tuple[float, float]:

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import undertow as ut
-from runs import RECIPE
+from runs import RECIPE, short_searches
 from undertow.base import InvalidInputError
 from undertow.cascade import Admission, CascadeState
 from undertow.cascade.swing_up import Gains
@@ -58,6 +58,7 @@ def settled(controller: Controller, steps: int = 30) -> int:
     return steps
 
 
+@short_searches()
 def test_a_run_from_hanging_says_that_a_swing_up_is_searched_for() -> None:
     """Two minutes stood behind "warming up, 0 s left" for a mechanism of one's own."""
     told: list[str] = []
@@ -149,10 +150,11 @@ def test_an_estimate_of_another_shape_is_a_safe_stop(
     assert "estimated state: got shape" in controller.stopped_by
 
 
+@short_searches()
 def test_from_hanging_to_balance_through_the_states_and_the_same_again(tmp_path: Path) -> None:
     """Realistic rig, positions alone; the slow loop finds what catches; the replay agrees."""
     with session(SWINGING, simulated=True, log=tmp_path / "run.db") as runtime:
-        report = runtime.run(4.0)
+        report = runtime.run(2.5)
         end = runtime.rig.truth  # type: ignore[attr-defined]
     states = [text.split(":")[0] for _, what, text in report.events if what == "state"]
     assert states[:4] == [
@@ -168,6 +170,7 @@ def test_from_hanging_to_balance_through_the_states_and_the_same_again(tmp_path:
     )
 
 
+@short_searches()
 def test_after_a_knock_a_plan_in_reserve_takes_over_and_a_decision_comes_early() -> None:
     """φ̇ jumps by 13 rad/s; what is not knocked over by it is up 1.2 s later."""
     recipe = replace(RECIPE, rig="realistic", parameters={})
@@ -194,10 +197,10 @@ def test_after_a_knock_a_plan_in_reserve_takes_over_and_a_decision_comes_early()
     assert controller.mode in (Mode.CATCH, Mode.BALANCE)
 
 
+@short_searches()
 def test_what_a_recipe_starts_with_depends_on_it_alone() -> None:
     """To the bit, so that the tests may search once for each recipe: ``first_once`` in conftest."""
-    made = RECIPE.first()
-    again = vars(Recipe.first)["__wrapped__"](replace(RECIPE))
+    made, again = RECIPE.first(), replace(RECIPE).first()
     assert replace(again, estimate=made.estimate) == made
     assert str(again.estimate) == str(made.estimate)
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import itertools
 import json
+import multiprocessing
 import os
 import shutil
-import signal
 import sqlite3
 import struct
 import subprocess
@@ -16,6 +17,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
@@ -305,37 +307,32 @@ def test_what_is_no_log_is_refused(tmp_path: Path, what: str) -> None:
         read_log(path)
 
 
-KILLED = """
-import sys, time
-import numpy as np
-from pathlib import Path
-sys.path.insert(0, {source!r})
-from undertow.mechanisms import rotary_pendulum
-from undertow.runtime import Columns
-from undertow.runtime.log import Log
-columns = Columns.of(rotary_pendulum())
-log = Log(Path({path!r}), columns, {{}})
-began = time.perf_counter()
-for k in range(100_000):
-    while time.perf_counter() < began + 1e-3 * k:
-        time.sleep(2e-4)
-    log.row[:] = k
-    log.commit_row()
-    if k % 50 == 0:
-        print(k, flush=True)
-"""
+def write_for_ever(path: Path, said: Connection) -> None:
+    """Write a row each millisecond, and tell of every fiftieth."""
+    log, began = Log(path, COLUMNS, {}), time.perf_counter()
+    for k in itertools.count():
+        while time.perf_counter() < began + 1e-3 * k:
+            time.sleep(2e-4)
+        log.row[:] = k
+        log.commit_row()
+        if k % 50 == 0:
+            said.send(k)
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the writer is a forked process")
 def test_a_log_whose_writer_was_killed_opens(tmp_path: Path) -> None:
     """SIGKILL in the middle of writing: the file is sound, and no row is missing between."""
     path = tmp_path / "killed.db"
-    script = KILLED.format(source=str(Path(ut.__file__).parents[1]), path=str(path))
-    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    said = [int(process.stdout.readline()) for _ in range(9)]
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    process.stdout.close()
+    heard, telling = multiprocessing.Pipe(duplex=False)
+    process = multiprocessing.get_context("fork").Process(
+        target=write_for_ever, args=(path, telling), daemon=True
+    )
+    process.start()
+    said = [heard.recv() for _ in range(9)]
+    process.kill()
+    process.join()
+    heard.close()
+    telling.close()
     rows = read_log(path).steps
     np.testing.assert_array_equal(rows[:, 0], np.arange(len(rows)))
     assert len(rows) >= said[0]

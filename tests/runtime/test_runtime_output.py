@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from runs import RECIPE
+from support import rest_slow
 from undertow.base import ArtefactError, ResourceError
 from undertow.cascade import CascadeState
 from undertow.plants import Measurement, OutputOnError
@@ -104,7 +105,7 @@ def fails(when: Callable[[int], bool], error: BaseException) -> Callable[[int, o
 # -- zero is written until the device has taken it -------------------------------------------------
 
 
-@pytest.mark.parametrize("every", [2, 10, 20])
+@pytest.mark.parametrize("every", rest_slow([2, 10, 20], 2, 20))
 def test_the_output_is_off_after_a_run_in_which_writes_fail(
     every: int, controller: Controller, tmp_path: Path
 ) -> None:
@@ -135,11 +136,11 @@ def test_zero_is_insisted_on_for_a_stated_time(controller: Controller) -> None:
         return device
 
     late = stubborn(500)
-    report = driven(controller, late).report
+    report = driven(controller, late, 0.2).report
     assert report.output_zero
     assert not late.accepted.any()
     never = stubborn(math.inf)
-    verdict = driven(RECIPE.make_controller(controller.memory), never).report.verdict
+    verdict = driven(RECIPE.make_controller(controller.memory), never, 0.2).report.verdict
     assert never.accepted.any()
     assert not verdict.output_zero
     assert (
@@ -152,12 +153,12 @@ def test_zero_is_insisted_on_for_a_stated_time(controller: Controller) -> None:
 
 def test_a_close_that_fails_is_told(controller: Controller) -> None:
     """Also where it is known by the driver that its inputs are not at zero."""
-    report = driven(controller, Device(close=OSError("bus"))).report
+    report = driven(controller, Device(close=OSError("bus")), 0.2).report
     assert report.output_zero
     assert "close: OSError: bus" in report.verdict.output_problem
     assert report.verdict.exit_code == EXIT_CODES["degraded"]
     known = Device(close=OutputOnError("relay stuck"))
-    verdict = driven(RECIPE.make_controller(controller.memory), known).report.verdict
+    verdict = driven(RECIPE.make_controller(controller.memory), known, 0.2).report.verdict
     assert not verdict.output_zero
     assert verdict.exit_code == EXIT_CODES["output on"]
 
@@ -323,7 +324,7 @@ def test_a_sensor_that_is_mostly_missing_stops_the_run(
         assert f"sensor '{name}' missing in 60% of the readings" in report.stopped_by
 
 
-@pytest.mark.parametrize("every", [19, 7, 3])
+@pytest.mark.parametrize("every", rest_slow([19, 7, 3], 19, 3))
 def test_a_reading_that_is_missing_now_and_then_does_not_keep_the_law_from_taking_over(
     every: int, controller: Controller
 ) -> None:
@@ -604,7 +605,7 @@ def test_the_cost_of_a_run_is_the_integral_of_its_stage_cost(
     """Against the log: Φ = (u/15)² + 0.01 xᵀx, and ‖x‖ of the last estimate."""
     from undertow.runtime import read_log
 
-    report = driven(controller, Device(), 1.0, tmp_path / "run.db").report
+    report = driven(controller, Device(), 0.5, tmp_path / "run.db").report
     recording = read_log(tmp_path / "run.db")
     x = np.column_stack([recording[name] for name in RECIPE.belief.state_names])
     stage = (recording["voltage"] / 15.0) ** 2 + 0.01 * (x**2).sum(axis=1)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import undertow as ut
+from runs import short_searches
 from undertow.base import InvalidInputError
 from undertow.law import ReferenceMotion
 from undertow.plants import IdealRig
@@ -57,6 +58,7 @@ def test_a_target_past_the_travel_is_refused_before_the_rig_is_read(cascade: ut.
         ut.run(cascade, rig, seconds=1.0, x0=CRANE.state(), simulated=True, target={"x": 2.0})
 
 
+@short_searches()
 def test_a_jump_is_planned_on_the_estimate_of_its_request() -> None:
     """The slow loop's first plan for a new target, predicted for the plant that was learnt."""
     start = (0.0, 0.1, 0.0, 0.0)
