@@ -92,13 +92,13 @@ def test_code_of_a_solve_grows_with_n_cubed_and_not_with_the_entries(n: int) -> 
 # -- linear algebra --------------------------------------------------------------------------
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(square_matrices(st.integers(-9, 9)))
 def test_adjugate_times_matrix_is_the_determinant_times_the_identity(A: FloatArray) -> None:
     assert_adjugate(A)
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(square_matrices(st.integers(-9, 9)), st.data())
 def test_adjugate_exists_at_singular_matrices(A: FloatArray, data: st.DataObject) -> None:
     m = len(A)
@@ -185,7 +185,7 @@ FORMULAS: dict[str, sp.Expr] = {
 numbers = st.floats(-8, 8, allow_nan=False)
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(numbers, numbers, numbers)
 def test_compiled_tape_equals_sympy_substitution(x: float, y: float, z: float) -> None:
     values = compiled_formulas()(x, y, z)
