@@ -32,10 +32,13 @@ TASKS = {
 RIG = ut.mechanisms.rotary_pendulum()
 
 #: What makes a task shorter: words of its code, and others in their place.
+BUDGETS = "cold=ut.Budget(500), warm=ut.Budget(32)"
+QUICK = ("Cascade(rig, ut.MinimumTime())", f"Cascade(rig, ut.MinimumTime(), {BUDGETS})")
 COARSE = (
     ("bound(rig, ut.MinimumTime()", "bound(rig, ut.MinimumTime(), intervals=40"),
-    ("freedom=free", "freedom=free, cold=ut.Budget(500), warm=ut.Budget(32)"),
+    ("freedom=free", f"freedom=free, {BUDGETS}"),
 )
+BRIEF = (('"bench-energy"))', f'"bench-energy"), {BUDGETS})'), ("seconds=2", "seconds=1"))
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +46,8 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
     """What the page's first two blocks leave behind, in a folder for files."""
     found: dict[str, Any] = {}
     with chdir(tmp_path_factory.mktemp("everyday")):
-        for title in ("# Ten everyday tasks", "1. Simulate"):
-            exec(compile(TASKS[title], title, "exec"), found)
-        yield found
+        does("# Ten everyday tasks", found)
+        yield does("1. ", found, QUICK)
 
 
 def does(title: str, names: dict[str, Any], *shorter: tuple[str, str]) -> dict[str, Any]:
@@ -110,6 +112,8 @@ def test_film(names: dict[str, Any]) -> None:
 @pytest.mark.parametrize("shorter", [COARSE, pytest.param((), marks=pytest.mark.slow)], ids=len)
 def test_bound(names: dict[str, Any], shorter: tuple[tuple[str, str], ...]) -> None:
     pytest.importorskip("casadi")
+    if not shorter:
+        names = does("1. ", dict(names))
     assert 0 < does("5.", names, *shorter)["least"].cost < names["run"].cost
 
 
@@ -150,7 +154,7 @@ def test_a_run_from_objects_is_replayed_where_they_have_names(tmp_path: Path) ->
 
 
 def test_run(names: dict[str, Any]) -> None:
-    assert does("8.", names)["report"].verdict.ending in ("balanced", "caught")
+    assert does("8.", names, *BRIEF)["report"].verdict.ending in ("balanced", "caught")
 
 
 @pytest.mark.slow
@@ -217,8 +221,28 @@ def kept(run: ut.Run) -> list[Any]:
     ]  # fmt: skip
 
 
+#: What a fresh process says: what of this ``import undertow`` imports, then what a file has in it.
+LATE = ("undertow.runtime", "undertow.bounds", "undertow.export", "undertow.display", "pandas")
+FRESH = f"""import pickle, sys, undertow
+print([m for m in {LATE!r} if m in sys.modules])
+print(*map(repr, pickle.load(open(sys.argv[1], 'rb'))), sep='\\n')
+"""
+
+
+@pytest.fixture(scope="module")
+def fresh(names: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """What a process says that has imported nothing yet."""
+    file = tmp_path_factory.mktemp("kept") / "kept"
+    file.write_bytes(pickle.dumps(kept(names["run"])))
+    done = subprocess.run(
+        [sys.executable, "-c", FRESH, str(file)], capture_output=True, text=True, check=True,
+        encoding="utf-8", env={**__import__("os").environ, "PYTHONIOENCODING": "utf-8"},
+    )  # fmt: skip
+    return done.stdout.splitlines()
+
+
 def test_everything_is_pickled_and_read_in_a_fresh_process(
-    names: dict[str, Any], tmp_path: Path
+    names: dict[str, Any], fresh: list[str]
 ) -> None:
     """The same here, and in a process that has imported nothing yet."""
     items = kept(names["run"])
@@ -226,14 +250,7 @@ def test_everything_is_pickled_and_read_in_a_fresh_process(
         again = pickle.loads(pickle.dumps(item))
         assert type(again) is type(item)
         assert shown(again) == shown(item)
-    file = tmp_path / "kept"
-    file.write_bytes(pickle.dumps(items))
-    code = "import pickle, sys; print(*map(repr, pickle.load(open(sys.argv[1], 'rb'))), sep='\\n')"
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(file)], capture_output=True, text=True, check=True,
-        encoding="utf-8", env={**__import__("os").environ, "PYTHONIOENCODING": "utf-8"},
-    )  # fmt: skip
-    assert done.stdout.splitlines() == [repr(item) for item in items]
+    assert fresh[1:] == [repr(item) for item in items]
 
 
 def test_a_regulator_that_was_pickled_gives_the_same_inputs() -> None:
@@ -263,14 +280,11 @@ def test_reprs_are_short_and_notebooks_show_formulas(names: dict[str, Any]) -> N
     assert "<th>phi_dot<br>rad/s</th>" in table
 
 
-def test_every_public_name_is_there_and_imports_late() -> None:
+def test_every_public_name_is_there_and_imports_late(fresh: list[str]) -> None:
     """Tab completion lists what is imported when it is asked for, and nothing is imported twice."""
     for name in ut.__all__:
         assert name in dir(ut)
         assert getattr(ut, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'simulate'"):
         _ = ut.simulate
-    late = ("undertow.runtime", "undertow.bounds", "undertow.export", "undertow.display", "pandas")
-    code = f"import sys, undertow; print([m for m in {late!r} if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert fresh[0] == "[]"

@@ -59,7 +59,8 @@ USE = """
 import undertow as ut
 pendulum = ut.mechanisms.rotary_pendulum(d_e=0.025)
 surface = ut.Surface(alpha_a=-1, lambda_a=-1.59, alpha_u=1.96, lambda_u=12.1)
-cascade = ut.Cascade(pendulum, ut.MinimumEnergy(), first=surface, belief="exact")
+budgets = {"cold": ut.Budget(64), "warm": ut.Budget(32)}
+cascade = ut.Cascade(pendulum, ut.MinimumEnergy(), first=surface, belief="exact", **budgets)
 run = cascade.simulate(phi=0.3, duration=0.3)
 assert run.cost > 0
 """

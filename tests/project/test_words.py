@@ -57,8 +57,9 @@ from undertow.runtime.controller_defaults import default_gate, estimator_for
 from undertow.runtime.encoding import memory_from, memory_to
 from undertow.studies import survey
 from undertow.studies.motion import ended, motion_report
+from undertow.studies.paper.data import BASE
 from undertow.studies.trials.balance import controllers
-from undertow.studies.trials.steering import CascadeSteering
+from undertow.studies.trials.steering import CascadeSteering, keeping
 
 RIG = ut.mechanisms.rotary_pendulum(d_e=0.025)
 NOWHERE = replace(RIG, start={})
@@ -274,7 +275,7 @@ def test_gates_are_pickled() -> None:
 @pytest.fixture(scope="module")
 def simulated() -> tuple[int, str, str]:
     words = ("--start", "phi=5deg", "--objective", "time", "--set", "d_e=0.025")
-    return run("simulate", "rotary_pendulum", *words)
+    return run("simulate", "rotary_pendulum", *words, "--evaluations", "300")
 
 
 def plain(shown: str) -> str:
@@ -611,7 +612,10 @@ def _interrupted(moment: str) -> tuple[int, list[str]]:
     return process.returncode, said
 
 
-@pytest.mark.parametrize("moment", [" numpy.version\n", " undertow.closed_loop.kernel\n"])
+@pytest.mark.parametrize(
+    "moment",
+    [" numpy.version\n", pytest.param(" undertow.closed_loop.kernel\n", marks=pytest.mark.slow)],
+)
 def test_ctrl_c_while_importing_is_one_line(moment: str) -> None:
     """Among the first modules of others, and among our own."""
     assert _interrupted(moment) == (130, ["interrupted"])
@@ -737,6 +741,7 @@ def test_interrupted_balance_keeps_what_is_whole(
 
     calls = iter(range(100))
     honest = vars(balance)["trial"]
+    unsearched = {"base": keeping(RIG, BASE), "one-time": None}
 
     def some(*words: Any, **more: Any) -> Any:
         if next(calls) > 1:
@@ -744,6 +749,7 @@ def test_interrupted_balance_keeps_what_is_whole(
         return honest(*words, **more)
 
     monkeypatch.setattr(balance, "trial", some)
+    monkeypatch.setattr(balance, "makers", lambda *_: unsearched)
     words = ["trials", "balance", "--seeds", "1", "--no-limits", "--out", str(tmp_path)]
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 130, result.output

@@ -27,6 +27,7 @@ from undertow.base import (
 )
 from undertow.cli import app
 from undertow.closed_loop import ClosedLoop, Event
+from undertow.runtime.processes import fork
 from undertow.studies.campaign import (
     Campaign,
     Definition,
@@ -279,19 +280,18 @@ def test_a_campaign_goes_on_when_its_scheduler_was_killed(
 def test_a_process_killed_in_between_is_resumed(serial: Path, tmp_path: Path) -> None:
     """Kill -9 of everything after some shards; nothing finished is computed again."""
     path = tmp_path / "store"
-    code = f"""
-import os, signal
-from pathlib import Path
-from undertow.studies.campaign import *
-def stop(what, part):
-    if part > 0.4: os.kill(os.getpid(), signal.SIGKILL)
-with executor_for(threads=2) as (pool, width):
-    Campaign(Definition({MAP.mechanism!r}, {MAP.text!r}), Path({str(path)!r})).run(
-        pool, width=width, progress=stop)
-"""
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    ended = subprocess.run([sys.executable, "-c", code], env=environment, check=False, timeout=300)
-    assert ended.returncode == -signal.SIGKILL
+
+    def stop(_what: str, part: float) -> None:
+        if part > 0.4:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def work() -> None:
+        with executor_for(threads=2) as (pool, width):
+            Campaign(MAP, path).run(pool, width=width, progress=stop)
+
+    ended = fork(work, (), "a campaign that is killed", daemon=False)
+    ended.join(60.0)
+    assert ended.exitcode == -signal.SIGKILL
     marked = int((Store(path).marks() != 0).sum())
     assert 3 <= marked < 6
     outcome = resumed(path)
@@ -665,7 +665,8 @@ def test_pictures_show_slices_volumes_and_proved_sets(serial: Path, tmp_path: Pa
     drawn: Any = cost.collections[-1].get_array()
     shown = np.ma.filled(drawn, np.nan)
     assert np.nanmax(abs(shown - dataset(serial).cost.values.T)) == 0
-    on_surface = Definition.of(RIG, **CASE, axes=ON_SURFACE)
+    few = {name: axis | {"count": 21} for name, axis in ON_SURFACE.items()}
+    on_surface = Definition.of(RIG, **CASE, axes=few)
     run(on_surface, tmp_path / "on")
     image, words = picture_file(Campaign(on_surface, tmp_path / "on"), REGIONS)
     assert image.startswith(b"\x89PNG")

@@ -25,6 +25,7 @@ from undertow.proofs.region.motion import SurfaceMotion
 from undertow.proofs.search.region import ProvedRegion
 from undertow.studies import motion
 from undertow.studies.certification import (
+    Certified,
     appendix_report,
     certify_appendix,
     certify_run,
@@ -58,6 +59,12 @@ def run() -> ut.Run:
         RIG, GOAL, gate=gate, first=GOOD, cold=ut.Budget(64), warm=ut.Budget(32), belief="exact"
     )
     return cascade.simulate(phi=0.2)
+
+
+@pytest.fixture(scope="module")
+def certified(run: ut.Run) -> tuple[Certified, ...]:
+    """What is proved of each of its surfaces."""
+    return certify_run(RIG, run)
 
 
 def test_the_log_of_a_run_has_a_verdict_for_each_decision(run: ut.Run) -> None:
@@ -94,19 +101,20 @@ def test_a_run_is_shown_decision_by_decision(run: ut.Run) -> None:
     assert "without accepted evidence" in text(run_report(bare))
 
 
-def test_reports_are_readable_on_a_terminal_of_80_columns(run: ut.Run) -> None:
+def test_reports_are_readable_on_a_terminal_of_80_columns(
+    run: ut.Run, certified: tuple[Certified, ...]
+) -> None:
     """A few lines for each decision and claim: no column is squeezed to a letter a line."""
     decisions = text(run_report(run), 80).splitlines()
     assert len(decisions) <= 7 * min(len(run.updates), 13) + 5
-    certified = certify_run(RIG, run)[-1]
-    claims = text(subject_report(RIG, certified), 80).splitlines()
-    count = len(certified.subject.claims) + len(certified.subject.remarks)
+    last = certified[-1]
+    claims = text(subject_report(RIG, last), 80).splitlines()
+    count = len(last.subject.claims) + len(last.subject.remarks)
     assert count >= 4
     assert len(claims) <= 9 * count + 5
 
 
-def test_each_surface_of_a_run_is_certified(run: ut.Run) -> None:
-    certified = certify_run(RIG, run)
+def test_each_surface_of_a_run_is_certified(run: ut.Run, certified: tuple[Certified, ...]) -> None:
     assert [c.subject.surface for c in certified] == list(dict.fromkeys(run.surfaces))
     for item in certified:
         assert {"stability"} <= {claim.kind for claim in item.subject.claims}

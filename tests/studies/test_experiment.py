@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
@@ -63,6 +63,7 @@ PARTS = st.builds(
 )
 
 
+@settings(max_examples=25)
 @given(
     st.lists(PARTS, max_size=3),
     st.lists(st.lists(NUMBERS, min_size=2, max_size=2), min_size=1, max_size=3),

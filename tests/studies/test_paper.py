@@ -11,8 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import undertow as ut
+from undertow.closed_loop import figures
+from undertow.closed_loop.figures import figure_bytes
 from undertow.studies import paper
 from undertow.studies.paper import (
     CASES,
@@ -21,9 +24,11 @@ from undertow.studies.paper import (
     PRINTED,
     ROWS,
     catch_limit,
+    experiment,
     printed_motion,
     singular_angle,
 )
+from undertow.studies.paper.data import HORIZON_CLAIM
 from undertow.studies.paper.experiment import own_optimum
 from undertow.studies.paper.repeats import noisy_repeats
 from undertow.studies.paper.tables import COLUMNS, reasons
@@ -33,16 +38,29 @@ AS_PRINTED = ut.mechanisms.rotary_pendulum()
 
 @pytest.fixture(scope="module")
 def result() -> paper.Reproduction:
-    """A run of one condition with searches just long enough to find something."""
+    """A run of one condition with searches just long enough to find something, in 17 s at most."""
     effort = paper.Effort(
         ut.Budget(400), ut.Budget(33), bounds=False, appendix=False, conditions=("matched",)
     )
-    return paper.reproduction(effort=effort).run()
+
+    def shorter(rig: ut.Mechanism, objective: ut.Objective, **settings: Any) -> ut.Cascade:
+        return ut.Cascade(rig, replace(objective, horizon=HORIZON_CLAIM), **settings)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(experiment, "Cascade", shorter)
+        return paper.reproduction(effort=effort).run()
 
 
 @pytest.fixture(scope="module")
 def files(result: paper.Reproduction) -> dict[str, bytes]:
-    return paper.files(result)
+    """What it leaves behind, its figures drawn once: as PNG."""
+
+    def drawn(figure: Figure, kind: str) -> bytes:
+        return figure_bytes(figure) if kind == "png" else b"%PDF"
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures, "figure_bytes", drawn)
+        return paper.files(result)
 
 
 # -- what comes out ----------------------------------------------------------------------------
@@ -252,6 +270,7 @@ def test_figures_are_written_and_named(files: dict[str, bytes]) -> None:
     names = {name for name in files if name.startswith("figure")}
     stems = {"figure-3-repeats", "figure-4-energy", "figure-5-phase", "figure-6-time"}
     assert names == {f"{stem}.{kind}" for stem in stems for kind in ("png", "pdf")}
+    assert all(files[f"{stem}.png"].startswith(b"\x89PNG") for stem in stems)
 
 
 def test_own_optima_beat_the_printed_ones(result: paper.Reproduction) -> None:

@@ -182,7 +182,9 @@ def _bits(function: Any) -> list[Any]:
     return [np.asarray(each, dtype=float).tobytes() for each in (*result, *given[:3])]
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
+)
 def test_random_programs_give_the_bits_that_numba_gives(seed: int) -> None:
     """Loops, branches, elements and rows of arrays, whole numbers and reals, no numbers among them.
 

@@ -783,6 +783,8 @@ class Mechanism:
     def _evaluate(self, which: str, t: ArrayLike, x: FloatArray, *more: object) -> FloatArray:
         columns = [x[..., i] for i in range(x.shape[-1])]
         values = self.function(which)(t, *columns, *more, *self.parameter_values)
+        if x.ndim == 1 and not any(map(np.ndim, values)):
+            return np.array(values, dtype=float)
         shape = np.broadcast_shapes(x.shape[:-1], *(np.shape(v) for v in values))
         return np.stack([np.broadcast_to(v, shape) for v in values], axis=-1).astype(float)
 
@@ -836,7 +838,8 @@ class Mechanism:
         inputs = self._columns(
             "inputs", u, [i.name for i in self.inputs], "Give one number for each input, in a list"
         )
-        return self._evaluate("dynamics", floats("time", t), state, *np.moveaxis(inputs, -1, 0))
+        columns = [inputs[..., i] for i in range(self.m)]
+        return self._evaluate("dynamics", floats("time", t), state, *columns)
 
     def forces(self, t: float, x: ArrayLike, qdd: ArrayLike) -> FloatArray:
         """Inverse dynamics: M(q) q̈ − f(q, q̇), the generalised forces that give q̈, (…, n)."""
