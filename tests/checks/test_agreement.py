@@ -208,7 +208,7 @@ def test_compiled_code_of_the_library_is_that_of_the_symbols(name: str, what: st
     agree(found if name == "rotary_pendulum" else whatever_its_steps(found), limit)
 
 
-@pytest.mark.parametrize("real", ["double", "float"])
+@pytest.mark.parametrize("real", rest_slow(["double", "float"], "double"))
 @pytest.mark.parametrize("name", EVERY)
 def test_exported_c_of_the_library_is_that_of_the_symbols(
     name: str, real: str, tmp_path: Path

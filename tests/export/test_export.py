@@ -77,7 +77,7 @@ STRICT = (
 M = "two_motor_three_link"
 
 #: Mechanisms whose offers are tried by default: one of each shape.
-QUICK = {("rotary_pendulum", "double"), (M, "float"), ("gantry_crane", "double")}
+QUICK = {("rotary_pendulum", "float"), (M, "double"), ("gantry_crane", "double")}
 
 
 #: What is written of a controller depends on it alone: tests of the same one share it.
@@ -330,7 +330,7 @@ def test_whatever_comes_in_the_output_is_a_number_within_limit_and_slew(tmp_path
     last = np.zeros(2)
     with Build(controller, tmp_path).start() as process:
 
-        @settings(max_examples=60, deadline=None, database=None)
+        @settings(max_examples=30, deadline=None, database=None)
         @given(st.lists(measurement, min_size=1, max_size=20))
         def check(sequence: list[tuple[bool, list[float]]]) -> None:
             nonlocal last
@@ -1414,7 +1414,7 @@ def test_report_counts_instructions_and_bytes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "words",
-    rest_slow(["*\\ #error run /*", "/* */*/", "????/ \\", "kg/*m**/ ???"], "/* */*/", "????/ \\"),
+    rest_slow(["*\\ #error run /*", "/* */*/", "????/ \\", "kg/*m**/ ???"], "/* */*/"),
 )
 def test_words_of_a_user_stay_in_their_comment(words: str, tmp_path: Path) -> None:
     """Names, units and descriptions neither end a comment nor begin one: the C compiles."""

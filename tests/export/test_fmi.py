@@ -246,11 +246,11 @@ def test_steps_of_any_length_are_divided_evenly(place: Path) -> None:
 
 @pytest.mark.parametrize("name", rest_slow(["wheeled_inverted_pendulum", "cart"], "cart"))
 def test_a_plant_with_a_fast_motor_is_followed(name: str, tmp_path: Path) -> None:
-    """The wheels' back-EMF decays by 241/s, another's by 2000/s: a period of 4 ms is long."""
+    """The wheels' back-EMF decays by 241/s, another's by 800/s: a period of 4 ms is long."""
     from scipy.integrate import solve_ivp
 
     if name == "cart":
-        mechanism = LIBRARY["cart_pendulum"]().with_parameters(b_c=1000.0).with_input_limit(1e4)
+        mechanism = LIBRARY["cart_pendulum"]().with_parameters(b_c=400.0).with_input_limit(1e4)
     else:
         mechanism = LIBRARY[name]()
     surface, reaching = ut.first_surface(mechanism), ut.ReachingLaw(layer=1.0)
@@ -269,7 +269,7 @@ def test_a_plant_with_a_fast_motor_is_followed(name: str, tmp_path: Path) -> Non
     x0 = mechanism.state(**start)
     true = solve_ivp(rates, (0.0, 0.004), x0, "LSODA", rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(found, true.y[:, -1], rtol=2e-4, atol=1e-6)
-    assert np.isfinite(run_positions(controller)[0]).all()
+    assert np.isfinite(run_positions(controller)[-1]).all()
 
 
 def test_a_controller_takes_whole_periods(place: Path) -> None:

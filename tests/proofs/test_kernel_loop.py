@@ -144,7 +144,7 @@ def test_tubes_hold_motions_across_the_clip_and_the_layer() -> None:
     x[:, 1] = np.linspace(first, first + wide, 5)
     met = set[tuple[bool, bool]]()
     assert tube.hull[3].real > 0.1
-    for _ in range(100):
+    for _ in range(64):
         assert loop.advance(tube)
         x = rk4(x, 1 / 128, 1 / 1024, law)
         low, high = tube.image(states).real, tube.image(states).imag
