@@ -86,7 +86,7 @@ def test_a_periodic_reference_is_a_motion_of_the_mechanism(
     mechanism: ut.Mechanism, reference: ut.Reference
 ) -> None:
     """Open loop, with the inputs of the inverse dynamics alone, the crane stays on x_r for 2 s."""
-    asked, n, m = motion(mechanism, reference, 10.0), mechanism.n, mechanism.m
+    asked, n, m = motion(mechanism, reference, 4.0), mechanism.n, mechanism.m
     B = np.array(mechanism.input_matrix, dtype=float)
 
     def rates(t: float, x: np.ndarray) -> np.ndarray:
