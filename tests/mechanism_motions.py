@@ -153,10 +153,10 @@ class Claimed:
                     break
         return left | ~self.inside(x)
 
-    def tried(self, rng: np.random.Generator, count: int, size: float = 1.0) -> int:
-        """How many motions from the edges of the starts, so many times as large, fail."""
-        x = on_faces(self.starts * size)(rng, np.empty((count, 0)))
-        bad = np.nonzero(self.failed(x))[0][:16]
+    def tried(self, rng: np.random.Generator, count: int, step: float = STEP) -> int:
+        """How many motions from the edges of the starts fail."""
+        x = on_faces(self.starts)(rng, np.empty((count, 0)))
+        bad = np.nonzero(self.failed(x, step))[0][:16]
         return int(self.failed(x[bad], STEP / FINER).sum()) if len(bad) else 0
 
     def share(self, rng: np.random.Generator, count: int) -> float:

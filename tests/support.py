@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
 from types import SimpleNamespace
@@ -13,6 +14,7 @@ import pytest
 import sympy as sp
 
 import undertow as ut
+from undertow.export import host
 from undertow.models import FloatArray
 
 #: (n, m) of the random systems on which the formulas are checked.
@@ -30,6 +32,14 @@ def rest_slow(cases: Iterable[object], *quick: object) -> list[object]:
         else pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=pytest.mark.slow)
         for case in cases
     ]
+
+
+@contextmanager
+def unoptimised() -> Iterator[None]:
+    """C is compiled as it is for users, but for the time that optimising takes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(host, "FLAGS", (*host.FLAGS, "-Og"))
+        yield
 
 
 @lru_cache(maxsize=32)

@@ -9,7 +9,7 @@ import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 import undertow as ut
-from support import bar, rest_slow
+from support import bar, rest_slow, unoptimised
 from undertow.base import (
     ArtefactError,
     InvalidInputError,
@@ -77,20 +77,28 @@ STRICT = (
 M = "two_motor_three_link"
 
 #: Mechanisms whose offers are tried by default: one of each shape.
-QUICK = {("rotary_pendulum", "double"), (M, "float"), ("gantry_crane", "double")}
+QUICK = {("rotary_pendulum", "float"), (M, "double"), ("gantry_crane", "double")}
+
+
+#: What is written of a controller depends on it alone: tests of the same one share it.
+written = lru_cache(maxsize=64)(files)
 
 
 @pytest.fixture(scope="module", autouse=True)
-def written_once() -> Iterator[None]:
-    """What is written of a controller depends on it alone: tests that build the same share it."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(host, "files", lru_cache(maxsize=64)(files))
+def quickly_built() -> Iterator[None]:
+    """C is written once, and compiled without optimising but where a test says so."""
+    with unoptimised(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(host, "files", written)
         yield
+
+
+#: A mechanism of the library: what is generated for its law is shared by its controllers.
+mechanism_named = cache(lambda name: LIBRARY[name]())
 
 
 @lru_cache(maxsize=64)
 def exported(name: str = "rotary_pendulum", **options: object) -> EmbeddedController:
-    mechanism = LIBRARY[name]()
+    mechanism = mechanism_named(name)
     surface = ut.first_surface(mechanism)
     return EmbeddedController(mechanism, surface, **options)  # type: ignore[arg-type]
 
@@ -132,8 +140,9 @@ def test_strict_c99_without_a_warning_and_its_own_test_passes(
     """
     controller = exported(name, real=real, differentiator=differentiator, slew=500.0)
     build = Build(controller, tmp_path)
+    build.compile([f"{name}.c"], "unit.o", *STRICT, "-O2", "-c")
     build.compile(
-        [f"{name}.c", f"{name}_test.c"], "strict", *STRICT, "-fsanitize=undefined,address"
+        [f"{name}.c", f"{name}_test.c"], "strict", *STRICT, "-O0", "-fsanitize=undefined,address"
     )
     done = subprocess.run([tmp_path / "strict"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -172,7 +181,7 @@ def test_estimator_limits_slew_and_plans_agree_over_a_long_run(
 def test_the_test_can_fail(tmp_path: Path) -> None:
     """A parameter that is 1 % off is found by the vectors."""
     controller = exported()
-    for name, content in files(controller).items():
+    for name, content in written(controller).items():
         text = re.sub(r"(UT_PARAMETER_\d+_m) 0\.125\b", r"\1 0.12625", content.decode())
         (tmp_path / name).write_text(text)
     passed, said = Build(controller, tmp_path).self_test()
@@ -180,10 +189,14 @@ def test_the_test_can_fail(tmp_path: Path) -> None:
     assert " 0 failed" not in said
 
 
-def test_agrees_with_python_at_1e5_random_states(tmp_path: Path) -> None:
-    """Show 6: relative difference ≤ 1e-12 in double precision."""
-    agreement = Build(exported(), tmp_path).agreement(100_000)
-    assert agreement.states == 100_000
+@pytest.mark.parametrize("states", rest_slow([10_000, 100_000], 10_000))
+def test_agrees_with_python_at_1e5_random_states(
+    states: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Show 6: relative difference ≤ 1e-12 in double precision, of C that is optimised."""
+    monkeypatch.setattr(host, "FLAGS", FLAGS)
+    agreement = Build(exported(), tmp_path).agreement(states)
+    assert agreement.states == states
     assert max(agreement.output, agreement.demand, agreement.s, agreement.margin) <= 1e-12
 
 
@@ -259,7 +272,7 @@ def unbounded(source: str) -> list[str]:
 )
 def test_no_unbounded_loop_and_no_recursion(name: str, step: object) -> None:
     """Every loop counts to a constant; every function calls only those defined above it."""
-    source = files(exported(name, differentiator=step))[f"{name}.c"].decode()
+    source = written(exported(name, differentiator=step))[f"{name}.c"].decode()
     assert len(LOOP.findall(source)) >= 10
     assert unbounded(source) == []
 
@@ -275,7 +288,7 @@ def test_no_unbounded_loop_and_no_recursion(name: str, step: object) -> None:
 )
 def test_the_search_for_unbounded_loops_finds_them(planted: str) -> None:
     """The check above fails where it should."""
-    source = files(exported())["rotary_pendulum.c"].decode()
+    source = written(exported())["rotary_pendulum.c"].decode()
     head = "int ut_step(ut_controller *c, const ut_real q[UT_N], ut_real u[UT_M])\n{\n"
     assert head in source
     assert unbounded(source.replace(head, head + planted)) != []
@@ -284,7 +297,7 @@ def test_the_search_for_unbounded_loops_finds_them(planted: str) -> None:
 def test_no_heap_and_a_bounded_stack(tmp_path: Path) -> None:
     """The object file asks for nothing but maths, and its frames are static."""
     build = Build(exported(M), tmp_path)
-    build.compile([f"{M}.c"], "unit.o", "-c", "-fstack-usage")
+    build.compile([f"{M}.c"], "unit.o", "-O2", "-c", "-fstack-usage")
     undefined = subprocess.run(
         ["nm", "-u", "unit.o"], cwd=tmp_path, capture_output=True, text=True, check=True
     ).stdout.split()
@@ -317,7 +330,7 @@ def test_whatever_comes_in_the_output_is_a_number_within_limit_and_slew(tmp_path
     last = np.zeros(2)
     with Build(controller, tmp_path).start() as process:
 
-        @settings(max_examples=60, deadline=None, database=None)
+        @settings(max_examples=30, deadline=None, database=None)
         @given(st.lists(measurement, min_size=1, max_size=20))
         def check(sequence: list[tuple[bool, list[float]]]) -> None:
             nonlocal last
@@ -485,7 +498,7 @@ def fuzzed(controller: EmbeddedController, folder: Path, steps: int) -> list[int
     """Return outputs beyond a limit, plans accepted, faults, fallbacks, outputs other than 0."""
     build = Build(controller, folder)
     (folder / "fuzz.c").write_text(FUZZ.replace("NAME", controller.stem))
-    sanitised = ("-fsanitize=undefined,address", "-fno-sanitize-recover=all")
+    sanitised = ("-O0", "-fsanitize=undefined,address", "-fno-sanitize-recover=all")
     program = build.compile([f"{controller.stem}.c", "fuzz.c"], "fuzz", *sanitised)
     done = subprocess.run(
         [program, str(steps)], capture_output=True, text=True, check=False, timeout=600
@@ -497,9 +510,9 @@ def fuzzed(controller: EmbeddedController, folder: Path, steps: int) -> list[int
 @pytest.mark.parametrize(
     ("name", "real", "step", "steps"),
     [
-        ("rotary_pendulum", "double", DerivativeStep(), 60_000),
+        ("rotary_pendulum", "double", DerivativeStep(), 20_000),
         pytest.param(M, "float", DerivativeStep(), 60_000, marks=pytest.mark.slow),
-        ("rotary_pendulum", "float", KalmanStep(), 60_000),
+        ("rotary_pendulum", "float", KalmanStep(), 20_000),
         *(
             pytest.param(name, real, step, 3_000_000, marks=pytest.mark.slow)
             for name, real, step in (
@@ -623,7 +636,7 @@ def test_each_word_of_the_memory_is_checked_where_it_is_used(real: str, tmp_path
     build = Build(exported(real=real, slew=4000.0), tmp_path)
     (tmp_path / "words.c").write_text(WORDS)
     program = build.compile(
-        ["rotary_pendulum.c", "words.c"], "words", "-fsanitize=undefined,address"
+        ["rotary_pendulum.c", "words.c"], "words", "-O0", "-fsanitize=undefined,address"
     )
     done = subprocess.run([program], capture_output=True, text=True, check=True)
     assert not done.stderr
@@ -734,7 +747,7 @@ def test_the_report_of_an_export_has_a_line_for_each_controller() -> None:
 
 def test_a_plan_takes_over_row_by_row_as_in_python(tmp_path: Path) -> None:
     """A table of three surfaces built in, then another offered: equal outputs, equal switches."""
-    rig = LIBRARY[M]()
+    rig = mechanism_named(M)
     controller = EmbeddedController(rig, three_rows(rig))
     later = three_rows(rig, 0.9)
     rng = np.random.default_rng(0)
@@ -791,7 +804,7 @@ def test_offers_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
 
 def test_a_plan_is_sealed_by_its_sender_and_damage_on_the_way_is_noticed(tmp_path: Path) -> None:
     """One bit of any word of a row, or of its check word: refused; whole: taken."""
-    rig = LIBRARY["rotary_pendulum"]()
+    rig = mechanism_named("rotary_pendulum")
     controller = EmbeddedController(rig, three_rows(rig))
     starts, rows = controller.starts(controller.plan), plan_numbers(controller, controller.plan)
     checks = checksums(2, starts, rows, "double")
@@ -892,7 +905,7 @@ def test_a_plan_whose_motion_does_not_die_out_is_refused(
     number, stable, unstable = 1, 0, 0
     rest = np.zeros(mechanism.n)
     with Build(controller, tmp_path).start() as process:
-        for k in range(200):
+        for k in range(100):
             flips = np.where(rng.random(len(vector)) < 0.15 * (k % 2), -1.0, 1.0)
             spread = 0.05 if k % 3 else 0.4
             changed = vector * flips * rng.uniform(1 - spread, 1 + spread, len(vector))
@@ -1166,14 +1179,14 @@ def test_far_from_zero_single_precision_rounds_as_the_page_says() -> None:
 
 def test_two_controllers_link_into_one_program(tmp_path: Path) -> None:
     """Prefixes keep their names apart, and C++ may include the headers."""
-    for name, prefix in (("rotary_pendulum", "one"), (M, "two")):
+    for name, prefix in (("rotary_pendulum", "one"), ("cart_pendulum", "two")):
         Build(exported(name, prefix=prefix), tmp_path)
     (tmp_path / "main.c").write_text(
-        f'#include "rotary_pendulum.h"\n#include "{M}.h"\n'
+        '#include "rotary_pendulum.h"\n#include "cart_pendulum.h"\n'
         "int main(void)\n{\n    static one_controller a;\n    static two_controller b;\n"
-        "    one_init(&a);\n    two_init(&b);\n    return ONE_N + TWO_N - 5;\n}\n"
+        "    one_init(&a);\n    two_init(&b);\n    return ONE_N + TWO_N - 4;\n}\n"
     )
-    sources = ["main.c", "rotary_pendulum.c", f"{M}.c"]
+    sources = ["main.c", "rotary_pendulum.c", "cart_pendulum.c"]
     done = gcc(tmp_path, *FLAGS, *STRICT, *sources, "-lm", "-o", "both")
     assert done.returncode == 0, done.stderr
     assert subprocess.run([tmp_path / "both"], check=False).returncode == 0
@@ -1296,7 +1309,7 @@ def test_missing_tools_and_broken_c_are_said(tmp_path: Path) -> None:
     with pytest.raises(MissingExtraError, match="Install no-such-compiler"):
         tool("no-such-compiler")
     controller = exported()
-    for name, content in files(controller).items():
+    for name, content in written(controller).items():
         (tmp_path / name).write_bytes(content)
     (tmp_path / "rotary_pendulum.c").write_text("int x = ;\n")
     with pytest.raises(ArtefactError, match="expected expression"):
@@ -1335,7 +1348,7 @@ def test_command_writes_tests_and_says_so(tmp_path: Path) -> None:
     header = written["rotary_pendulum.h"].decode()
     assert "theta  rad  arm angle about the vertical" in header
     assert "voltage, at most 15 V, 400 V/s" in header
-    invoke(*request, "--out", str(tmp_path / "again"))
+    invoke(*request[:-1], "--out", str(tmp_path / "again"))
     assert written == {p.name: p.read_bytes() for p in (tmp_path / "again").iterdir()}
 
 
@@ -1401,7 +1414,7 @@ def test_report_counts_instructions_and_bytes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "words",
-    rest_slow(["*\\ #error run /*", "/* */*/", "????/ \\", "kg/*m**/ ???"], "/* */*/", "????/ \\"),
+    rest_slow(["*\\ #error run /*", "/* */*/", "????/ \\", "kg/*m**/ ???"], "/* */*/"),
 )
 def test_words_of_a_user_stay_in_their_comment(words: str, tmp_path: Path) -> None:
     """Names, units and descriptions neither end a comment nor begin one: the C compiles."""

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import undertow as ut
-from support import rest_slow
+from support import rest_slow, unoptimised
 from undertow.base import InvalidInputError, MissingExtraError
 from undertow.export import EmbeddedController, Status, SuperTwistingStep, Twin, carriers
 from undertow.export.co_simulation import Variable, base_units
@@ -40,16 +40,23 @@ def exported(name: str = "rotary_pendulum", real: str = "double") -> EmbeddedCon
     return EmbeddedController(mechanism, ut.first_surface(mechanism), real=real)  # type: ignore[arg-type]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def compiled_soon() -> Iterator[None]:
+    """Units are compiled without optimising."""
+    with unoptimised():
+        yield
+
+
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the two units of the rotary pendulum, and what is unpacked from them."""
     folder = tmp_path_factory.mktemp("units")
-    unpack(exported(), folder)
+    unpack(fmi_units(exported()), folder)
     return folder
 
 
-def unpack(controller: EmbeddedController, folder: Path) -> None:
-    for name, content in fmi_units(controller).items():
+def unpack(made: dict[str, bytes], folder: Path) -> None:
+    for name, content in made.items():
         (folder / name).write_bytes(content)
         fmpy.extract(str(folder / name), str(folder / Path(name).stem))
 
@@ -164,7 +171,7 @@ def check_units(controller: EmbeddedController, folder: Path) -> None:
 @pytest.mark.parametrize("name", ["two_motor_three_link"])
 def test_units_are_valid_and_equal_python(name: str, tmp_path: Path) -> None:
     """Show 6: FMPy has no complaint, and there are 1e-9 between a unit and Python."""
-    unpack(exported(name), tmp_path)
+    unpack(fmi_units(exported(name)), tmp_path)
     check_units(exported(name), tmp_path)
 
 
@@ -175,7 +182,7 @@ def test_units_of_the_rotary_pendulum(place: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(LIBRARY))
 def test_units_of_every_mechanism(name: str, tmp_path: Path) -> None:
-    unpack(exported(name), tmp_path)
+    unpack(fmi_units(exported(name)), tmp_path)
     check_units(exported(name), tmp_path)
 
 
@@ -239,16 +246,17 @@ def test_steps_of_any_length_are_divided_evenly(place: Path) -> None:
 
 @pytest.mark.parametrize("name", rest_slow(["wheeled_inverted_pendulum", "cart"], "cart"))
 def test_a_plant_with_a_fast_motor_is_followed(name: str, tmp_path: Path) -> None:
-    """The wheels' back-EMF decays by 241/s, another's by 2000/s: a period of 4 ms is long."""
+    """The wheels' back-EMF decays by 241/s, another's by 800/s: a period of 4 ms is long."""
     from scipy.integrate import solve_ivp
 
     if name == "cart":
-        mechanism = LIBRARY["cart_pendulum"]().with_parameters(b_c=1000.0).with_input_limit(1e4)
+        mechanism = LIBRARY["cart_pendulum"]().with_parameters(b_c=400.0).with_input_limit(1e4)
     else:
         mechanism = LIBRARY[name]()
     surface, reaching = ut.first_surface(mechanism), ut.ReachingLaw(layer=1.0)
     controller = EmbeddedController(mechanism, surface, reaching, period=0.004)
-    unpack(controller, tmp_path)
+    unit = plant_unit(controller)
+    unpack({f"{unit.name}.fmu": unit.build()}, tmp_path)
     names = states(mechanism)
     start = {names[1]: 0.1, names[2]: 1.0}
     with loaded(tmp_path, f"{controller.stem}_plant", start) as plant:
@@ -261,7 +269,7 @@ def test_a_plant_with_a_fast_motor_is_followed(name: str, tmp_path: Path) -> Non
     x0 = mechanism.state(**start)
     true = solve_ivp(rates, (0.0, 0.004), x0, "LSODA", rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(found, true.y[:, -1], rtol=2e-4, atol=1e-6)
-    assert np.isfinite(run_positions(controller)[0]).all()
+    assert np.isfinite(run_positions(controller)[-1]).all()
 
 
 def test_a_controller_takes_whole_periods(place: Path) -> None:
@@ -320,7 +328,7 @@ def test_single_precision_another_prefix_and_a_name_of_our_own_files(tmp_path: P
         real="float",
         prefix="arm",
     )
-    unpack(controller, tmp_path)
+    unpack(fmi_units(controller), tmp_path)
     with loaded(tmp_path, "model_rig_controller", {"loop.rates_measured": 1}) as law:
         law["phi"] = 0.125
         law.step(0.0)
@@ -469,7 +477,7 @@ def test_our_declarations_are_the_standards(kind: str, tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(content)
     (tmp_path / "fmi3.h").write_text('#include "fmi3Functions.h"\n')
     headers = Path(fmpy.__file__).parent / "c-code"
-    words = [w for w in FLAGS if w != "-Werror"]
+    words = [w for w in FLAGS if w != "-Werror"] + ["-Og"]
     done = subprocess.run(
         ["gcc", *words, "-Werror", f"-isystem{headers}", "-c", "unit.c", "-o", "unit.o"],
         cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60,

@@ -136,6 +136,7 @@ def test_switching_functions_are_odd_bounded_and_agree_with_their_names(
 # -- disturbances and gains ------------------------------------------------------------------
 
 
+@lru_cache(maxsize=8)
 def declared(mechanism: ut.Mechanism) -> ut.Mechanism:
     """The mechanism with disturbance bounds on all coordinates."""
     return mechanism.with_disturbance_bounds(*(0.3 + 0.2 * i for i in range(mechanism.n)))

@@ -138,7 +138,7 @@ def test_claims_that_are_too_large_are_noticed(
     assert not any(failed(data, simulator, 16).values())
     for claim in data["subjects"][0]["claims"]:
         larger(claim, factor)
-    counted = failed(data, simulator, 200)
+    counted = failed(data, simulator, 80)
     if name == "regions.json":  # inner sets are small, and in the regions of attraction still
         counted = dict([counted.popitem()])
     assert counted

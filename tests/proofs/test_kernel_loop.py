@@ -144,9 +144,9 @@ def test_tubes_hold_motions_across_the_clip_and_the_layer() -> None:
     x[:, 1] = np.linspace(first, first + wide, 5)
     met = set[tuple[bool, bool]]()
     assert tube.hull[3].real > 0.1
-    for _ in range(100):
+    for _ in range(64):
         assert loop.advance(tube)
-        x = rk4(x, 1 / 128, 1 / 2560, law)
+        x = rk4(x, 1 / 128, 1 / 1024, law)
         low, high = tube.image(states).real, tube.image(states).imag
         assert (x >= low - 1e-5).all()
         assert (x <= high + 1e-5).all()
@@ -175,7 +175,7 @@ def test_cuts_say_where_tubes_begin_and_decide_nothing() -> None:
     assert one.kind == three.kind == "proved"
     assert sentence(whole, MODEL) == sentence(cut, MODEL)
     assert three.details["tubes"] == 3 > one.details["tubes"]
-    far = replace(cut, starts={"phi": (Fraction(-4, 5), Fraction(4, 5))})
+    far = replace(cut, starts={"phi": (Fraction(4, 5), Fraction(4, 5))})
     assert decide(MODEL, NUMBERS, far).kind == "undecided"  # 45.8° falls
 
 
@@ -313,7 +313,7 @@ def test_starts_of_full_dimension_converge() -> None:
 
 def test_what_is_false_or_not_decided_is_not_proved() -> None:
     """45.5° falls in simulation; a larger ellipsoid is no terminal set."""
-    last = rk4(np.array([[0.0, math.radians(45.5), 0.0, 0.0]]), 1.0, 2e-3)
+    last = rk4(np.array([[0.0, math.radians(45.5), 0.0, 0.0]]), 1.0, 5e-3)
     assert not abs(last[0, 1]) < 0.5
     loop = ContinuousLoop(MODEL, NUMBERS, terminal().W, terminal().radius, STEP)
     end = math.radians(45.5)

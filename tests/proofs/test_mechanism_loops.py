@@ -77,9 +77,15 @@ def proved(name: str) -> None:
 
 
 def test_starts_of_full_dimension_are_proved_from_their_file() -> None:
+    """What is decided is the half of each state's interval, without a cut."""
     assert (kept("tora")[0].starts[:, 1] >= [0.284, 0.1136, 0.426, 0.142]).all()
     assert (kept("cart_pendulum")[1].starts[:, 1] >= [0.0568, 0.1136, 0.1136, 0.1136]).all()
-    proved("tora")
+    document = read(KEPT["tora"].read_bytes())
+    claim = read_claim(document.subjects[0].claims[0], document.model)
+    assert isinstance(claim, ClosedLoop)
+    half = {k: (low / 2, high / 2) for k, (low, high) in claim.starts.items()}
+    found = decide(document.model, document.subjects[0].law, replace(claim, starts=half, cuts={}))
+    assert found.kind == "proved", found.why
 
 
 @pytest.mark.slow  # up to a minute of one core each
@@ -114,7 +120,7 @@ def finely(claim: Claimed, x: FloatArray, duration: float) -> FloatArray:
     return np.asarray(found.y[:, -1])
 
 
-@pytest.mark.parametrize("name", rest_slow(sorted(KEPT), "tora", "cart_pendulum", "gantry_crane"))
+@pytest.mark.parametrize("name", rest_slow(sorted(KEPT), "tora", "gantry_crane"))
 def test_steps_are_fine_enough(name: str) -> None:
     """From the outermost start, by another method to 1e-10, over clip and edge of the layer."""
     for claim in kept(name):
@@ -128,7 +134,7 @@ def test_steps_are_fine_enough(name: str) -> None:
 @pytest.mark.parametrize("name", rest_slow(["tora", "ball_and_beam"], "tora"))
 def test_motions_from_the_edges_of_quick_claims_come_home(name: str) -> None:
     for claim in kept(name):
-        assert claim.tried(np.random.default_rng(1), 40) == 0
+        assert claim.tried(np.random.default_rng(1), 40, COARSER * STEP) == 0
 
 
 @pytest.mark.slow

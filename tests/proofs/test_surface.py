@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
+from functools import cache
 
 import numpy as np
 import pytest
@@ -21,7 +22,14 @@ from undertow.law import (
 )
 from undertow.law.sliding import singularity
 from undertow.models import linearise
-from undertow.proofs import Verdict, hurwitz, nonsingular, reaching, singular_distance
+from undertow.proofs import (
+    ReachingCertificate,
+    Verdict,
+    hurwitz,
+    nonsingular,
+    reaching,
+    singular_distance,
+)
 from undertow.proofs.claims.model_data import law_of, model_of
 from undertow.proofs.exact_model import (
     exact_fraction,
@@ -84,8 +92,6 @@ def test_floats_count_as_the_binary_numbers_that_they_are() -> None:
             for kind in (False, True)
         ],
         (2, 1, False),
-        (3, 1, False),
-        (3, 2, False),
         (4, 2, False),
         (3, 2, True),
     ),
@@ -96,7 +102,7 @@ def test_hurwitz_agrees_with_the_pencil(n: int, m: int, symbolic: bool) -> None:
     rng = np.random.default_rng(n + m)
     seen = set()
     surfaces = [ut.first_surface(mechanism, rate=rate) for rate in (0.0, 0.5)]
-    for _ in range(12):
+    for _ in range(5):
         surfaces.append(ut.Surface.from_vector(rng.normal(size=2 * m * n), n, m))
     for surface in surfaces:
         margin = pencil_margin(mechanism, surface)
@@ -134,7 +140,7 @@ def test_closed_forms_hold_iff_the_hurwitz_test_does() -> None:
     for mechanism in (RIG, linear_mechanism(2, 1, 3)):
         kinds = []
         first = ut.first_surface(mechanism).vector
-        for _ in range(60):
+        for _ in range(24):
             surface = ut.Surface.from_vector(first * (1 + 0.8 * rng.normal(size=4)), 2, 1)
             whole = hurwitz(mechanism, surface).kind
             parts = closed_forms_hold(mechanism, surface)
@@ -318,6 +324,12 @@ def test_regions_must_hold_the_target() -> None:
 REGION = {"phi": (-0.8, 0.8)}
 
 
+@cache
+def carried() -> ReachingCertificate:
+    """What K = 20 carries there."""
+    return reaching(RIG, BASE, REGION, 20.0)
+
+
 def surface_rate(
     mechanism: ut.Mechanism, surface: ut.Surface, q: np.ndarray, g: np.ndarray
 ) -> np.ndarray:
@@ -340,7 +352,7 @@ def surface_rate(
 @pytest.mark.parametrize("coordinate", [0, 1])
 def test_largest_disturbance_is_tight_against_the_plant(coordinate: int) -> None:
     """At the witness the refuted disturbance beats K = 20, the proved one does not."""
-    found = reaching(RIG, BASE, REGION, 20.0).largest[coordinate]
+    found = carried().largest[coordinate]
     assert found.proved <= found.refuted <= found.proved * 1.002
     assert found.unit == "N m"
     q = np.array(list(found.witness.values()))
@@ -348,14 +360,14 @@ def test_largest_disturbance_is_tight_against_the_plant(coordinate: int) -> None
     g[coordinate] = found.refuted
     assert 20.0 <= abs(surface_rate(RIG, BASE, q, g)[0]) <= 20.0 * 1.002
     rng = np.random.default_rng(0)
-    for phi in rng.uniform(-0.8, 0.8, 50):
+    for phi in rng.uniform(-0.8, 0.8, 12):
         g[coordinate] = found.proved
         assert abs(surface_rate(RIG, BASE, np.array([0.3, phi]), g)[0]) <= 20.0
 
 
 def test_matched_disturbance_in_volts() -> None:
     """The matched bound, as a voltage: torque over the motor's constant."""
-    matched, unmatched = reaching(RIG, BASE, REGION, 20.0).largest
+    matched, unmatched = carried().largest
     assert matched.as_input == pytest.approx(matched.proved / 0.1285)
     assert matched.input_unit == "V"
     assert math.isnan(unmatched.as_input)
@@ -365,10 +377,10 @@ def test_a_gain_too_small_for_the_disturbance_is_refuted() -> None:
     """K = 20 carries 0.02 N m on the arm with η = 4 left, but not with η = 6."""
     loaded = RIG.with_disturbance_bounds(0.02, 0.0)
     assert reaching(loaded, BASE, REGION, 20.0, eta=4.0).verdict
-    verdict = reaching(loaded, BASE, REGION, 20.0, eta=6.0).verdict
-    assert verdict.kind == "refuted"
-    assert verdict.margin < 0
-    assert reaching(loaded, BASE, REGION, 20.0, eta=6.0).scale == 0.0
+    found = reaching(loaded, BASE, REGION, 20.0, eta=6.0)
+    assert found.verdict.kind == "refuted"
+    assert found.verdict.margin < 0
+    assert found.scale == 0.0
 
 
 def test_a_stated_disturbance_that_k_does_not_carry_is_refused_in_engineering_units() -> None:

@@ -10,6 +10,7 @@ import math
 import re
 import textwrap
 from dataclasses import fields
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,9 @@ from undertow.export.estimate import estimate_code
 from undertow.export.names import LARGEST, ascii_words, at_most, c_name, macros, prefixed, template
 from undertow.export.routh import characteristic_polynomial
 from undertow.export.twin import vectors
-from undertow.law import LawSymbols, Plan, Surface, build_law_graph
+from undertow.law import LawSymbols, Plan, Surface, Switching, build_law_graph
 from undertow.models import Mechanism
-from undertow.symbolic import C99Emitter, Tape, literal
+from undertow.symbolic import C99Emitter, Real, Tape, literal
 
 #: Values of the templates that hold a user's words: their ``ut_`` stays as it is.
 _WORDS = {
@@ -197,7 +198,12 @@ def _parameters(controller: EmbeddedController) -> str:
 
 def _generated_parts(controller: EmbeddedController) -> dict[str, str]:
     """Return the statements of the law and of det Γ(0), and the estimator."""
-    mechanism, switching = controller.mechanism, controller.reaching.switching
+    law = _law_code(controller.mechanism, controller.reaching.switching, controller.real)
+    return law | _estimator(controller)
+
+
+@lru_cache(maxsize=16)
+def _law_code(mechanism: Mechanism, switching: Switching, real: Real) -> dict[str, str]:
     n, m = mechanism.n, mechanism.m
     symbols = LawSymbols.of(n, m)
     names: dict[sp.Symbol, str] = {x: f"x[{i}]" for i, x in enumerate(mechanism.x)}
@@ -215,21 +221,21 @@ def _generated_parts(controller: EmbeddedController) -> dict[str, str]:
     results |= {f"out->s[{i}]": e for i, e in enumerate(law.s)}
     results |= {f"out->gain[{i}]": e for i, e in enumerate(law.gains)}
     results["out->margin"] = law.margin
-    evaluate = C99Emitter(tape, names, controller.real).statements(results)
+    evaluate = C99Emitter(tape, names, real).statements(results)
 
     tape = Tape()
     target = mechanism.partition(tape, dict.fromkeys(mechanism.x, sp.Integer(0)))
     blocks = symbols.blocks
     _, determinant = tape.adjugate(tape.matrix(blocks.alpha_a - blocks.alpha_u * target.X))
-    gamma = C99Emitter(tape, names, controller.real).statements({"value": determinant})
+    gamma = C99Emitter(tape, names, real).statements({"value": determinant})
 
     tape = Tape()
     powers = tape.let_all(characteristic_polynomial(mechanism, symbols.surface))
     powers += [sp.Integer(0)] * (2 * n + 2 - len(powers))
-    polynomial = C99Emitter(tape, names, controller.real).statements(
+    polynomial = C99Emitter(tape, names, real).statements(
         {f"a[{k}]": a for k, a in enumerate(powers)}
     )
-    return {"law": evaluate, "gamma": gamma, "polynomial": polynomial, **_estimator(controller)}
+    return {"law": evaluate, "gamma": gamma, "polynomial": polynomial}
 
 
 def _estimator(controller: EmbeddedController) -> dict[str, str]:
