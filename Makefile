@@ -16,6 +16,9 @@ OPTIMISE := -O2
 # Python keeps what it compiles, whatever the environment says: the tests start many processes.
 unexport PYTHONDONTWRITEBYTECODE
 
+# Workers have the cores: threads of BLAS beside them would wait for each other.
+test slow coverage: export OPENBLAS_NUM_THREADS = 1
+
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help setup demo test slow coverage check bench docs checker clean
