@@ -190,7 +190,7 @@ def bound(
     --------
     >>> import undertow as ut
     >>> rig = ut.mechanisms.rotary_pendulum(d_e=0.025)
-    >>> found = bound(rig, ut.MinimumTime(), phi=ut.deg(41), intervals=20)
+    >>> found = bound(rig, ut.MinimumTime(), phi=ut.deg(41))
     >>> round(found.cost, 2)
     0.51
     """

@@ -150,8 +150,7 @@ class Cascade:
     --------
     >>> import undertow as ut
     >>> rig = ut.mechanisms.rotary_pendulum(d_e=0.025)
-    >>> cascade = ut.Cascade(rig, ut.MinimumTime(), cold=ut.Budget(500), warm=ut.Budget(32))
-    >>> run = cascade.simulate(phi=ut.deg(20))
+    >>> run = ut.Cascade(rig, ut.MinimumTime()).simulate(phi=ut.deg(20))
     >>> run.reached
     True
     """
