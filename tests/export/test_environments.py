@@ -113,7 +113,7 @@ def test_each_of_many_is_as_it_would_be_alone(name: str) -> None:
     first, again = many.reset(seed=7)[0], alone.reset(seed=7)[0]
     np.testing.assert_array_equal(first, again)
     push = rng.uniform(-1, 1, (count, 1))  # each pushes one way: carts run into their ends
-    for _ in range(300):
+    for _ in range(600):
         one, two = many.step(push), alone.step(push)
         for mine, theirs in zip(one[:4], two[:4], strict=True):
             np.testing.assert_array_equal(mine, theirs)

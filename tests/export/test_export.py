@@ -905,7 +905,7 @@ def test_a_plan_whose_motion_does_not_die_out_is_refused(
     number, stable, unstable = 1, 0, 0
     rest = np.zeros(mechanism.n)
     with Build(controller, tmp_path).start() as process:
-        for k in range(100):
+        for k in range(200):
             flips = np.where(rng.random(len(vector)) < 0.15 * (k % 2), -1.0, 1.0)
             spread = 0.05 if k % 3 else 0.4
             changed = vector * flips * rng.uniform(1 - spread, 1 + spread, len(vector))
