@@ -23,7 +23,17 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-__all__ = ["Clock", "clock", "command_line", "need", "percentiles", "progress", "race", "table"]
+__all__ = [
+    "Clock",
+    "clock",
+    "command_line",
+    "mechanism_names",
+    "need",
+    "percentiles",
+    "progress",
+    "race",
+    "table",
+]
 
 Clock = Callable[[], float]
 Item = TypeVar("Item")
@@ -61,6 +71,20 @@ def command_line(
             "for a machine that others use as well",
         )
     return parser
+
+
+def mechanism_names(parser: argparse.ArgumentParser) -> None:
+    """Let mechanisms of the library be named, as ``names``; others are refused."""
+    from undertow.mechanisms import LIBRARY
+
+    def known(name: str) -> str:
+        if name not in LIBRARY:
+            raise argparse.ArgumentTypeError(
+                f"no mechanism {name!r}; there are {', '.join(LIBRARY)}"
+            )
+        return name
+
+    parser.add_argument("names", nargs="*", metavar="NAME", type=known, help="which mechanisms")
 
 
 def clock(name: str) -> Clock:

@@ -2,9 +2,7 @@
 
 A yardstick for mechanisms whose cascade is far from the optimal-control bound: u = −K x, clipped,
 with K of weights q I on the state and I on the input.  Printed for each mechanism: the cheapest
-∫uᵀu dt until ‖x‖ ≤ 0.01 within 60 s, its q, and when it arrives.
-
-    python benchmarks/regulator.py tora [NAME ...]
+∫uᵀu dt until ‖x‖ ≤ 0.01 within 60 s, its q, and when it arrives.  Without a name: of TORA.
 """
 
 from __future__ import annotations
@@ -17,6 +15,8 @@ import scipy.linalg
 
 import undertow as ut
 from undertow.models import FloatArray, linearise
+
+from harness import command_line, mechanism_names  # isort: skip
 
 WEIGHTS = 10.0 ** np.arange(-9.0, 1.0)
 HORIZON = 60.0
@@ -52,8 +52,9 @@ def run(mechanism: ut.Mechanism, q: float) -> tuple[float, float]:
 
 def main() -> int:
     """Sweep the weights for each mechanism that is named."""
-    names = [name for name in sys.argv[1:] if name != "--quick"]
-    for name in names or ["tora"]:
+    parser = command_line(__doc__, "tora reaction_wheel_pendulum", clocks=False)
+    mechanism_names(parser)
+    for name in parser.parse_args().names or ["tora"]:
         mechanism = ut.mechanisms.LIBRARY[name]()
         (cost, arrival), q = min((run(mechanism, q), q) for q in WEIGHTS)
         print(f"{name}: {cost:.3g} with q = {q:.1e}, arrives at {arrival:.1f} s", flush=True)

@@ -8,7 +8,7 @@ Printed side by side for the largest mechanisms (n = 4) and the paper's: seconds
 and of the clock, in all and for each part.  The clock counts what else the machine does; the
 processor's seconds do not.  The import of the libraries alone is the least that a start can take.
 
-    python benchmarks/start.py [--quick] [NAME ...]
+With ``--quick`` the paper's mechanism alone is started.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ import time
 from pathlib import Path
 
 import undertow
+
+from harness import command_line, mechanism_names  # isort: skip
 
 NAMES = ("rotary_pendulum", "gantry_crane", "triple_pendulum_on_a_cart")
 
@@ -101,10 +103,11 @@ def row(name: str, parts: Parts) -> None:
 
 
 def main() -> int:
-    """Run everything; ``--quick`` starts the paper's mechanism alone."""
-    words = sys.argv[1:]
-    names = [word for word in words if not word.startswith("-")]
-    chosen = names or (NAMES[:1] if "--quick" in words else NAMES)
+    """Start each mechanism."""
+    parser = command_line(__doc__, "acrobot tora", clocks=False)
+    mechanism_names(parser)
+    options = parser.parse_args()
+    chosen = options.names or (NAMES[:1] if options.quick else NAMES)
     heads = " ".join(f"{head:>15s}" for head in ("total", *PARTS))
     print(f"{'s, processor and clock':40s}{heads}")
     for name in chosen:

@@ -76,6 +76,20 @@ def test_the_help_of_every_option_can_be_printed(script: str) -> None:
                 assert str(given.value.value) % defaultdict(int)
 
 
+@pytest.mark.parametrize("script", sorted(set(SCRIPTS) - HELPERS))
+def test_every_benchmark_has_help_with_examples(script: str) -> None:
+    """They would run for minutes where somebody asks what they do."""
+    text = (FOLDER / f"{script}.py").read_text(encoding="utf-8")
+    assert re.search(r"^    .*(command_line|argparse.ArgumentParser)\(", text, re.MULTILINE)
+    assert "sys.argv[1:]" not in text
+
+
+def test_a_mechanism_that_is_none_is_refused_by_a_benchmark() -> None:
+    refused = run(str(FOLDER / "regulator.py"), "tra")
+    assert refused.returncode == 2
+    assert "no mechanism 'tra'; there are rotary_pendulum" in refused.stderr
+
+
 def test_an_unknown_benchmark_is_refused_with_the_known_ones() -> None:
     refused = run(str(FOLDER), "kernal")
     assert refused.returncode == 2
