@@ -19,6 +19,7 @@ import compiled_lines
 import undertow as ut
 from undertow.cascade import CascadeState
 from undertow.law import Plan
+from undertow.optimiser import Optimiser
 from undertow.runtime import Recipe
 from undertow.symbolic.compiler import UNSUITED
 
@@ -92,8 +93,11 @@ def plain_lines_are_plain() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def first_once() -> Iterator[None]:
-    """What a recipe of the library's names starts with depends on it alone: tests share it."""
-    found: dict[str, CascadeState] = {}
+    """What a recipe of the library's names starts with depends on it alone: tests share it.
+
+    And on how long is searched: ``short_searches`` of runs.py.
+    """
+    found: dict[tuple[str, object], CascadeState] = {}
     searched = Recipe.first
 
     @functools.wraps(searched)
@@ -103,9 +107,10 @@ def first_once() -> Iterator[None]:
         own = recipe.design or recipe.estimator or isinstance(recipe.target, ut.Reference)
         if own or not named or recipe.mechanism not in ut.mechanisms.LIBRARY:
             return searched(recipe)
-        if repr(parts) not in found:
-            found[repr(parts)] = searched(recipe)
-        return found[repr(parts)]
+        key = repr(parts), vars(Optimiser)["usual_cold"]
+        if key not in found:
+            found[key] = searched(recipe)
+        return found[key]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Recipe, "first", first)

@@ -376,9 +376,9 @@ RESULTS = ("LoopMargins", "MechanismReport", "Proposal", "Run", "Trajectory")
 MADE_BY_USERS = [
     owner
     for room in (ut, ut.plants, ut.runtime, ut.export)
-    for name, owner in ((name, getattr(room, name)) for name in room.__all__)
-    if dataclasses.is_dataclass(owner) and (room is ut or hasattr(owner, "__post_init__"))
-    if name not in RESULTS and isinstance(owner, type)
+    for owner in (getattr(room, name) for name in room.__all__)
+    if isinstance(owner, type) and dataclasses.is_dataclass(owner)
+    if owner.__name__ not in RESULTS and (room is ut or hasattr(owner, "__post_init__"))
 ]
 
 

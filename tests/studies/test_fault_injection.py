@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import undertow as ut
+from support import rest_slow
 from undertow.cascade import CascadeState
 from undertow.law import Plan
 from undertow.models import FloatArray
@@ -67,9 +68,7 @@ LATER = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("part", "name"), [*QUICK, *(pytest.param(*one, marks=pytest.mark.slow) for one in LATER)]
-)
+@pytest.mark.parametrize(("part", "name"), rest_slow([*QUICK, *LATER], *QUICK))
 def test_a_fault_ends_as_it_should(part: str, name: str, tmp_path: Path) -> None:
     """Sound outputs, a safe end, an identical replay, held where possible, and its verdict."""
     seconds = {"actuator": 1.5, "answer": 0.6}.get(part, 1.0)

@@ -10,6 +10,7 @@ import numba
 import numpy as np
 import pytest
 
+from support import rest_slow
 from undertow.symbolic import compiled, load_module
 from undertow.symbolic.compiler import UNSUITED
 
@@ -182,9 +183,7 @@ def _bits(function: Any) -> list[Any]:
     return [np.asarray(each, dtype=float).tobytes() for each in (*result, *given[:3])]
 
 
-@pytest.mark.parametrize(
-    "seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
-)
+@pytest.mark.parametrize("seed", rest_slow(range(40), 0))
 def test_random_programs_give_the_bits_that_numba_gives(seed: int) -> None:
     """Loops, branches, elements and rows of arrays, whole numbers and reals, no numbers among them.
 

@@ -42,14 +42,17 @@ def mechanism_named(
     SI units, largest magnitudes of inputs in the input's unit.
     """
     mechanism = named(name).with_parameters(**parse_values(settings))
-    if not limits:
-        return mechanism
-    new = parse_values(limits, "limit of input", "voltage=10")
+    return mechanism.with_input_limit(*parse_limits(mechanism, limits)) if limits else mechanism
+
+
+def parse_limits(mechanism: Mechanism, words: Sequence[str] | None) -> tuple[float, ...]:
+    """Return the limit of each input, the mechanism's own where no word ``name=value`` names it."""
+    new = parse_values(words, "limit of input", "voltage=10")
     known = {channel.name: channel.limit for channel in mechanism.inputs}
     example = f"Write for instance --limit {next(iter(known))}=10"
     for channel in new:
         one_of(f"input of '{mechanism.name}'", channel, known, example)
-    return mechanism.with_input_limit(*(known | new).values())
+    return tuple((known | new).values())
 
 
 def aimed(name: str, target: Sequence[str] | None) -> tuple[str, list[str]]:

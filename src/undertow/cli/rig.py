@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal, cast
@@ -24,6 +23,7 @@ from undertow.cli import options
 from undertow.cli.parsing import (
     aimed,
     mechanism_named,
+    parse_limits,
     parse_new_target,
     parse_start,
     parse_target,
@@ -140,13 +140,11 @@ def run(
 
     name, target = aimed(name, target)
     belief = mechanism_named(name, setting)
-    settings = Settings(lead_time=lead)
-    if limit:
-        limits = mechanism_named(name, setting, limit).input_limits.tolist()
-        for channel, most in zip(belief.inputs, limits, strict=True):
-            what = f"limit of input '{channel.name}'"
-            between(what, most, 0.0, channel.limit, channel.unit, "A rig gets no more than its own")
-        settings = replace(settings, output_limit=tuple(limits))
+    limits = parse_limits(belief, limit)
+    for channel, most in zip(belief.inputs, limits, strict=True):
+        what = f"limit of input '{channel.name}'"
+        between(what, most, 0.0, channel.limit, channel.unit, "A rig gets no more than its own")
+    settings = Settings(lead_time=lead, output_limit=limits if limit else math.inf)
     hanging = swing_up and not start
     goal = parse_target(belief, target)
     recipe = Recipe(
