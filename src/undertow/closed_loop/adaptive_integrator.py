@@ -344,7 +344,7 @@ def follow() -> Any:
         look, look, whole, table, _ROW, block, numba.int64[::1], _ROW, _ROW, _ROW, block, real,
         real, real, whole, _ROW, *[real] * 5, _ROW, whole, block, table,
     )  # fmt: skip
-    return compiled(signature)(_follow)
+    return compiled(signature, small=True)(_follow)
 
 
 def look_source(program: LoopGraph, *, header: str) -> str:

@@ -237,7 +237,7 @@ class SearchSpace:
         return self.loop.roll_out(buffers, self.freedom.times, **how)
 
 
-@compiled()
+@compiled(small=True)
 def _decode(rows, base, places, width, fastest, vectors, gains):  # type: ignore[no-untyped-def]
     m, free = gains.shape[2] // 2, len(places)
     for k in range(rows.shape[0]):

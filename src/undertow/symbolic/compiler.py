@@ -37,13 +37,16 @@ UNSUITED: list[str] = []
 class Compiler(compiler.Compiler):  # type: ignore[misc]
     """numba's compiler of functions whose plain lines are parts."""
 
+    #: Attributes of the functions, LLVM's words.
+    attributes: tuple[str, ...] = ()
+
     def compile_extra(self, function: Any) -> Any:
         """Compile a function."""
         from undertow.symbolic.outlining import outline  # with what only compiling needs
 
         outlined, parts = outline(function)
         for part in parts:
-            part.enter(self.state.typingctx, self.state.targetctx)
+            part.enter(self.state.typingctx, self.state.targetctx, self.attributes)
         try:
             return super().compile_extra(outlined)
         except errors.NumbaError as error:
@@ -66,23 +69,35 @@ class Compiler(compiler.Compiler):  # type: ignore[misc]
                 part.leave(self.state.targetctx)
 
 
+class SmallCompiler(Compiler):
+    """The same for as little code as goes: loops over a few coordinates stay loops.
+
+    Unrolled and vectorised, as LLVM does it, they are twice the code and take twice the time to
+    compile.
+    """
+
+    attributes = ("optsize",)
+
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def compiled(*signature: Any, **options: Any) -> Any:
+def compiled(*signature: Any, small: bool = False, **options: Any) -> Any:
     """Return the decorator of this package's compiled functions: no lock of the interpreter.
 
     Nor are there exceptions: arithmetic is NumPy's. ``*signature``: types of the arguments, for
-    a function that is compiled when it is defined. ``**options``: numba's.
+    a function that is compiled when it is defined. ``small``: the code is, for what is long and
+    has no lanes. ``**options``: numba's.
     """
-    usual = {"cache": True, "nogil": True, "no_cfunc_wrapper": True, "pipeline_class": Compiler}
+    pipeline = SmallCompiler if small else Compiler
+    usual = {"cache": True, "nogil": True, "no_cfunc_wrapper": True, "pipeline_class": pipeline}
     return numba.njit(*signature, error_model="numpy", **{**usual, **options})
 
 
 def brief(**options: Any) -> Callable[[Function], Function]:
-    """Return the same for functions that take about a microsecond.
+    """Return the same for small functions, which take about a microsecond.
 
     They keep the interpreter's lock: to let go of it for so short a time is to hand it to another
     thread, and to wait.
     """
-    return cast(Callable[[Function], Function], compiled(nogil=False, **options))
+    return cast(Callable[[Function], Function], compiled(nogil=False, small=True, **options))

@@ -26,7 +26,7 @@ PREAMBLE = (
 #: another one calls is inlined there: else the process that compiles it calls it in its own
 #: library, later ones the copy that was stored with its caller, and the two round otherwise.  Every
 #: operation is rounded by itself: which ones a compiler would fuse depends on what went before.
-COMPILED = "@compiled(forceinline=True)"
+COMPILED = "@compiled(forceinline=True, small=True)"
 
 
 def function_source(

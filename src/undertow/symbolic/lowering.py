@@ -63,8 +63,10 @@ class Part:
     def __call__(self) -> None:
         """Let numba take it for a function."""
 
-    def enter(self, typing_context: Any, target_context: Any) -> None:
-        """Make it known to numba."""
+    def enter(
+        self, typing_context: Any, target_context: Any, attributes: Sequence[str] = ()
+    ) -> None:
+        """Make it known to numba; ``attributes``: of the functions that it is part of."""
         part, kinds = self, dict[Any, Any]()
 
         class Template(typing.templates.AbstractTemplate):  # type: ignore[misc]
@@ -77,6 +79,8 @@ class Part:
                 return typing.signature(kinds[args].result, *args)
 
         def write(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            for attribute in attributes:
+                builder.function.attributes.add(attribute)
             return _Instructions(part, context, builder, kinds[signature.args]).write(values)
 
         write.signature = (types.VarArg(types.Any),)  # type: ignore[attr-defined]
