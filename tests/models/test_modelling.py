@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -486,6 +487,10 @@ def test_motors_that_do_not_exist_are_refused() -> None:
         modelling.voltage_driven(ut.mechanisms.pendubot(), {"elbow": motor})
     with pytest.raises(ModelError, match="in V already"):
         modelling.voltage_driven(ut.mechanisms.rotary_pendulum(), motor)
+    cart = ut.mechanisms.cart_pendulum()
+    tonnes = replace(cart, inputs=(ut.Input("force", "kN", 0.1),), input_matrix=[[1000]])
+    with pytest.raises(ModelError, match="got in kN, must be a torque in N m or a force in N"):
+        modelling.voltage_driven(tonnes, motor)
 
 
 # -- one's own mechanism ----------------------------------------------------------------------
