@@ -395,7 +395,8 @@ def least_peak(mechanism: Mechanism, x: FloatArray) -> float:
     decay = np.exp(-np.outer(rates, t))
     part = (decay[:, :-1] - decay[:, 1:]) / rates[:, None]
     pushes = np.einsum("rk,ri->rki", part, modes.T @ lin.input * limits).reshape(len(rates), -1)
-    size = pushes.shape[1]
+    size, scale = pushes.shape[1], np.abs(pushes).max() or 1.0
+    pushes /= scale  # limits of any size are solved for alike
     equal = np.hstack([np.vstack([pushes.real, pushes.imag]), np.zeros((2 * len(rates), 1))])
     wanted = -np.hstack([(modes.T @ x).real, (modes.T @ x).imag])
     peak = np.vstack([np.hstack([sign * np.eye(size), -np.ones((size, 1))]) for sign in (1, -1)])
@@ -407,7 +408,7 @@ def least_peak(mechanism: Mechanism, x: FloatArray) -> float:
         b_eq=wanted,
         bounds=[(None, None)] * size + [(0, None)],
     )
-    return float(found.fun or 0.0) if found.status == 0 else 0.0
+    return float(found.fun or 0.0) / float(scale) if found.status == 0 else 0.0
 
 
 def _position(mechanism: Mechanism, q: FloatArray) -> str:
