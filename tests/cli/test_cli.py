@@ -41,6 +41,7 @@ from undertow.cli.parsing import (
 from undertow.cli.terminal import carry_out, progress_bar, show
 from undertow.closed_loop import Event, Trajectory
 from undertow.closed_loop.trajectory import recorded
+from undertow.objective import USUAL
 from undertow.proofs import read_certificate
 from undertow.studies.certification import decide
 from undertow.studies.experiment import Experiment
@@ -984,6 +985,18 @@ def test_a_port_that_is_none_is_refused_before_the_page_is_made() -> None:
     assert code == 2
     assert "65535" in err
     assert "making ready" not in err
+
+
+def test_every_command_minimises_the_same_where_nobody_says() -> None:
+    """What `simulate --control one-time` finds is what `export c --control one-time` writes."""
+    usual = {
+        words: option.default
+        for words, command in COMMANDS.items()
+        for option in command.params
+        if option.name == "objective" and words != ("survey",)  # which has several
+    }
+    assert ("export", "c") in usual
+    assert set(usual.values()) == {USUAL}
 
 
 def test_a_unit_that_is_typed_is_not_said_to_be_wanted_in_si() -> None:

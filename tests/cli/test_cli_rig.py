@@ -79,6 +79,10 @@ def test_a_run_is_logged_and_its_replay_is_identical(tmp_path: Path) -> None:
         (("run", "rotary_pendulum", "--rig", "realistic", "--delay", "-1"), "≥ 0"),
         (("run", "rotary_pendulum", "--limit", "voltage=20"), "20 V, must be 0 V to 15 V"),
         (("run", "rotary_pendulum", "--limit", "volt=5"), "one of voltage"),
+        (("run", "cart_pendulum", "--travel", "x=3m"), "3 m, must be 0 m to 1.5 m"),
+        (("run", "cart_pendulum", "--travel", "x=30"), "--travel x=30m"),
+        (("run", "cart_pendulum", "--travel", "x_dot=1m/s"), "one of x, phi"),
+        (("run", "cart_pendulum", "--travel", "x=0.2m", "--target", "x=0.5m"), "≤ 0.19 m"),
     ],
 )
 def test_bad_words_are_refused_in_one_line(words: tuple[str, ...], value: str) -> None:

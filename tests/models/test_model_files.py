@@ -421,6 +421,16 @@ def test_a_start_is_within_what_the_inputs_reach(pole: Path) -> None:
     assert weak.start["hinge"] == pytest.approx(0.5 * math.radians(5) / needed, rel=1e-2)
 
 
+def test_what_is_needed_of_the_limits_is_known_of_the_smallest_ones() -> None:
+    """Of limits that are 1e-8 of what is needed nothing was said: they were taken for zero."""
+    cart = ut.mechanisms.cart_pendulum()
+    start, (limit,) = cart.state(phi=ut.deg(20.0)), cart.input_limits.tolist()
+    needed = modelling.least_peak(cart, start)
+    for part in (1e-6, 1e-9, 1e-12):
+        weak = cart.with_input_limit(part * limit)
+        assert part * modelling.least_peak(weak, start) == pytest.approx(needed, rel=1e-9)
+
+
 def test_parameters_that_would_move_the_target_are_known(pole: Path) -> None:
     """Claim: where a centre of mass is off the axis, learning it would move the equilibrium."""
     names = set(Belief.usual(named(str(pole))).tolerances)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -251,6 +252,27 @@ def test_targets_that_are_no_equilibria_are_refused() -> None:
         modelling.find_equilibrium(ball, theta=0.3)
 
 
+def test_a_target_that_seems_to_be_in_degrees_is_told_of() -> None:
+    """phi=180 was said to have no equilibrium near; a guess of 180 found one at 179.07 rad."""
+    rig = ut.mechanisms.cart_pendulum()
+    words = r"phi = 180 rad is 10313°: if degrees are meant, give undertow\.deg\(180\)"
+    with pytest.raises(ModelError, match=words):
+        modelling.move_target(rig, phi=180)
+    with pytest.raises(ModelError, match=words):
+        modelling.from_matrices(
+            "hanging", rig.coordinates, rig.inputs, sp.Matrix(rig.mass_matrix),
+            sp.Matrix(rig.force), [[1], [0]], parameters=rig.parameters, equilibrium={"phi": 180},
+        )  # fmt: skip
+    for search in (
+        lambda: modelling.find_equilibrium(rig, phi=180.0),
+        lambda: modelling.at_equilibrium(rig, {"phi": 180.0}),
+    ):
+        with pytest.warns(UserWarning, match=words):
+            search()
+    moved = modelling.move_target(rig, phi=3 * math.pi)  # hanging, and meant: without a word
+    assert abs(moved.f(moved.state())).max() < 1e-9
+
+
 def test_targets_in_from_matrices() -> None:
     """Claim: the equilibrium may be given while building: ranges and coordinates shift with it."""
     rig = ut.mechanisms.cart_pendulum()
@@ -465,6 +487,10 @@ def test_motors_that_do_not_exist_are_refused() -> None:
         modelling.voltage_driven(ut.mechanisms.pendubot(), {"elbow": motor})
     with pytest.raises(ModelError, match="in V already"):
         modelling.voltage_driven(ut.mechanisms.rotary_pendulum(), motor)
+    cart = ut.mechanisms.cart_pendulum()
+    tonnes = replace(cart, inputs=(ut.Input("force", "kN", 0.1),), input_matrix=[[1000]])
+    with pytest.raises(ModelError, match="got in kN, must be a torque in N m or a force in N"):
+        modelling.voltage_driven(tonnes, motor)
 
 
 # -- one's own mechanism ----------------------------------------------------------------------

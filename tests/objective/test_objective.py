@@ -349,3 +349,15 @@ def test_a_cost_is_asked_for_at_the_target(rig: ut.Mechanism) -> None:
     pole = ut.Objective("pole", lambda v: 1 / v.theta**2)  # the cost of a motion from rest was NaN
     with pytest.raises(InvalidInputError, match=r"stage cost of 'pole': got nan"):
         pole.stage_cost(rig)
+
+
+def test_what_is_said_of_an_effort_tells_of_inputs_without_a_limit() -> None:
+    """Of two inputs, one of them unlimited, it read as if both counted in parts of their limits."""
+    arm = ut.mechanisms.two_motor_three_link()
+    bare = arm.with_input_limit(arm.inputs[0].limit, math.inf)
+    name = arm.inputs[1].name
+    for word in ("effort", "bench-time"):
+        assert f" dt (u_max = 1 N m of {name}, without a limit), s, to" in (
+            ut.objective_for(bare, word).meaning(bare)
+        )
+        assert "(u_max" not in ut.objective_for(arm, word).meaning(arm)

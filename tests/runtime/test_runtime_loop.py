@@ -281,8 +281,7 @@ def test_plans_are_made_within_the_travel_that_the_settings_leave(designed: bool
         settings=Settings(max_travel=1.0), estimator=lambda model, _: Measured(model),
     )  # fmt: skip
     words = [c.words for c in recipe.cascade.loop.objective.constraints]
-    rail = "-0.95 ≤ x ≤ 0.95" if "-0.95 ≤ x ≤ 0.95" in str(words) else "|x| ≤ 0.95"
-    assert f"{rail}: 95 % of Settings(max_travel=1)" in words
+    assert "|x| ≤ 0.95 m: 95 % of the max_travel of the run" in words
     assert "|phi| ≤ 0.5" in words
     assert not any("1.425" in word for word in words)
     wide = replace(recipe, settings=Settings(max_travel=30.0))
@@ -292,6 +291,23 @@ def test_plans_are_made_within_the_travel_that_the_settings_leave(designed: bool
     assert written is not None
     again = replace(Recipe.from_dict(written.as_dict()), estimator=named.estimator)
     assert again.cascade.objective == named.cascade.objective
+
+
+def test_each_coordinate_may_have_a_travel_of_its_own() -> None:
+    """Through a log's words, too; one for each, or one for all; ranges apply besides."""
+    cart = ut.mechanisms.cart_pendulum()
+    recipe = Recipe("cart_pendulum", settings=Settings(max_travel=(0.4, math.inf)))
+    again = Recipe.from_dict(json.loads(json.dumps(recipe.as_dict())))
+    assert again.settings == recipe.settings
+    assert again.settings.travels(cart).tolist() == [[-0.4, 0.4], [-math.inf, math.inf]]
+    words = [c.words for c in recipe.cascade.objective.constraints]
+    assert words == ["|x| ≤ 0.38 m: 95 % of the max_travel of the run"]
+    hinge = Settings(max_travel=(2.0, ut.deg(20.0)))
+    assert hinge.travels(cart)[0].tolist() == [-1.5, 1.5]
+    bounded = hinge.bounded(ut.objective_for(cart), cart)
+    assert "|phi| ≤ 19°" in [c.name for c in bounded.constraints]
+    with pytest.raises(InvalidInputError, match=r"max_travel: .*one number or 2"):
+        Settings(max_travel=(1.0, 2.0, 3.0)).travels(cart)
 
 
 @pytest.mark.parametrize("period", [0.0, 0.15, float("nan")])

@@ -312,7 +312,7 @@ def _target(mechanism: Mechanism) -> Iterator[Check]:
         left,
         "of |f| at rest",
         ("" if left <= _ROUNDING else f"{nearest_equilibrium(mechanism)}. ")
-        + "Shift the coordinates: undertow.models.importers.find_equilibrium and move_target",
+        + "Shift the coordinates: undertow.modelling.find_equilibrium and move_target",
     )
     yield Check(
         "inputs can hold the target, |B⁻¹ f_a(0, 0)| of their limits",

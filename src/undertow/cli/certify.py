@@ -36,6 +36,7 @@ from undertow.law import first_surface, usual_reaching
 from undertow.mechanisms import LIBRARY
 from undertow.models import Mechanism
 from undertow.models.importers.python_file import in_a_file
+from undertow.objective import USUAL
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -75,7 +76,7 @@ def certify(
     setting: options.Settings = None,
     run: bool = False,
     appendix: bool = False,
-    objective: options.Goal = "energy",
+    objective: options.Goal = USUAL,
     horizon: options.Horizon = 60.0,
     seconds: float | None = None,
     loop: bool = False,

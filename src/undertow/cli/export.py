@@ -33,7 +33,7 @@ from undertow.export.host import Build
 from undertow.law import SUITED, ReachingLaw, Surface, check_surface, first_surface
 from undertow.mechanisms import LIBRARY
 from undertow.models import Mechanism
-from undertow.objective import Goal
+from undertow.objective import USUAL, Goal
 from undertow.optimiser import Optimiser
 from undertow.plants.bench import bench_for
 from undertow.studies.rigs.export import upsets_table
@@ -76,7 +76,7 @@ def export_c(
     control: str | None = None,
     surface: options.SurfaceText = None,
     start: options.Start = None,
-    objective: options.Goal = "energy",
+    objective: options.Goal = USUAL,
     eta: float | None = None,
     layer: float | None = None,
     real: Literal["double", "float"] = "double",

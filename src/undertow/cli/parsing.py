@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from undertow.base import InvalidInputError, ModelError, one_of, require
+from undertow.base import InvalidInputError, ModelError, between, one_of, require
 from undertow.law import Reference, SetPoints, Surface, Target
 from undertow.mechanisms.named import DataName, named
 from undertow.models import FloatArray, Mechanism, invariant_coordinates, normal_name
@@ -53,6 +53,31 @@ def parse_limits(mechanism: Mechanism, words: Sequence[str] | None) -> tuple[flo
     for channel in new:
         one_of(f"input of '{mechanism.name}'", channel, known, example)
     return tuple((known | new).values())
+
+
+def parse_travels(mechanism: Mechanism, words: Sequence[str] | None) -> tuple[float, ...]:
+    """Return the largest magnitude of each coordinate, infinite where no word names it.
+
+    Words are like ``theta=60deg`` or ``x=0.3m``; more than the mechanism declares is refused.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> parse_travels(ut.mechanisms.cart_pendulum(), ["x=0.3m"])
+    (0.3, inf)
+    """
+    most = {c.name: math.inf for c in mechanism.coordinates}
+    for name, text in _pairs(words, f"{next(iter(most))}=LIMIT").items():
+        one_of(f"coordinate of '{mechanism.name}'", name, most)
+        units = _units_of(mechanism, name, "travel")
+        example = f"--travel {name}={_bare(text, '1')}{units[0]}"
+        number, unit = _quantity(text, units, f"travel of '{name}'", example)
+        most[name] = number * UNITS[unit][2]
+        own = next(c for c in mechanism.coordinates if c.name == name)
+        farthest = max(-own.low, own.high)
+        remedy = f"The mechanism has no more: it declares {own.low:g} to {own.high:g} {own.unit}"
+        between(f"travel of '{name}'", most[name], 0.0, farthest, own.unit, remedy)
+    return tuple(most.values())
 
 
 def aimed(name: str, target: Sequence[str] | None) -> tuple[str, list[str]]:

@@ -27,6 +27,7 @@ from undertow.cli.parsing import (
     parse_new_target,
     parse_start,
     parse_target,
+    parse_travels,
     parse_values,
 )
 from undertow.cli.show import open_page
@@ -54,7 +55,7 @@ if TYPE_CHECKING:
 @command(
     "undertow run rotary_pendulum --seconds 60 --lead 0.02",
     "undertow run rotary_pendulum --rig realistic --start phi=30deg --log bench.db",
-    "undertow run rotary_pendulum --rig realistic --limit voltage=5",
+    "undertow run rotary_pendulum --rig realistic --limit voltage=5 --travel theta=90deg",
     "undertow run cart_pendulum --simulated --seconds 10 --log run.db",
     "undertow run overhead_crane --target x=0.5m --target x=-0.5m@8s --seconds 16",
     "undertow run rotary_pendulum --target theta=20deg@0.25Hz --seconds 20",
@@ -72,6 +73,7 @@ def run(
     swing_up: bool = False,
     setting: options.Settings = None,
     limit: options.Limits = None,
+    travel: list[str] | None = None,
     known: Annotated[Literal["usual", "exact"], typer.Option("--belief")] = "usual",
     period: float = 0.001,
     delay: float | None = None,
@@ -107,6 +109,9 @@ def run(
         controller of a usual bench, which reckons with its encoders, delay and friction.
     swing_up
         Begin hanging at rest: swing up, catch, balance.
+    travel : COORDINATE=VALUE
+        Travel of the rig to both sides of 0, with units: theta=60deg, x=0.3m. The run is stopped
+        there, and plans keep to 95 % of it. Repeatable. Default: the mechanism's.
     known
         What the controller takes for known. usual: parameters within their tolerances, learnt as it
         runs. exact: the model.
@@ -144,7 +149,11 @@ def run(
     for channel, most in zip(belief.inputs, limits, strict=True):
         what = f"limit of input '{channel.name}'"
         between(what, most, 0.0, channel.limit, channel.unit, "A rig gets no more than its own")
-    settings = Settings(lead_time=lead, output_limit=limits if limit else math.inf)
+    settings = Settings(
+        lead_time=lead,
+        output_limit=limits if limit else math.inf,
+        max_travel=parse_travels(belief, travel) if travel else math.inf,
+    )
     hanging = swing_up and not start
     goal = parse_target(belief, target)
     recipe = Recipe(

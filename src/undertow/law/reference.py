@@ -717,9 +717,11 @@ def _stable_inversion(
         if not change < 1e6:
             break
     if not change < ENOUGH:
+        most = np.abs(a[:, :m]).max(axis=0)
+        fastest = mechanism.coordinates[int(most.argmax())]
         raise InvalidInputError(
             f"reference of '{mechanism.name}'",
-            value=f"largest acceleration {np.abs(a[:, :m]).max():.3g}",
+            value=f"'{fastest.name}' accelerated by {most.max():.3g} {fastest.unit}/s²",
             limit="one that the unactuated coordinates can follow, bounded",
             remedy="Make the reference slower",
         )

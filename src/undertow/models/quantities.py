@@ -332,7 +332,7 @@ def in_degrees(coordinates: Sequence[Coordinate], m: int, x: FloatArray) -> str:
     """What to do where a free one of x, (2n,), is more than a turn off zero; empty if none is."""
     for c, angle in zip(coordinates[m:], x[m:].tolist(), strict=False):
         if c.unit == "rad" and abs(angle) > 2 * math.pi:
-            turns = f"{c.name} = {angle:.4g} rad is {math.degrees(angle):.4g}°"
+            turns = f"{c.name} = {angle:.4g} rad is {math.degrees(angle):.0f}°"
             return f"{turns}: if degrees are meant, give undertow.deg({angle:.4g})"
     return ""
 

@@ -12,6 +12,7 @@ from undertow.objective.objective import (
     MinimumTime,
     Objective,
     check_travel,
+    range_words,
     state_box,
 )
 
@@ -27,5 +28,6 @@ __all__ = [
     "check_travel",
     "finite_limits",
     "objective_for",
+    "range_words",
     "state_box",
 ]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import isinf
 from typing import Literal, get_args
 
 import numpy as np
@@ -106,18 +107,20 @@ def objective_for(
     """
     one_of("objective", word, get_args(Goal))
     limits = tuple(finite_limits(mechanism).tolist())
+    free = [f"1 {i.unit}".rstrip() + f" of {i.name}" for i in mechanism.inputs if isinf(i.limit)]
+    scaled = f" (u_max = {', '.join(free)}, without a limit)" if free else ""
     energy = MinimumEnergy()
     time = Objective(
         word,
         _Effort(limits, 1, ENERGY_PRICE, 0.0),
         "s",
-        formula=f"∫ (1 + {ENERGY_PRICE:g} Σ (u/u_max)²) dt",
+        formula=f"∫ (1 + {ENERGY_PRICE:g} Σ (u/u_max)²) dt{scaled}",
     )
     effort = Objective(
         word,
         _Effort(limits, 0, 1.0, ERROR_PRICE),
         "s",
-        formula=f"∫ (Σ (u/u_max)² + {ERROR_PRICE:g} xᵀx) dt",
+        formula=f"∫ (Σ (u/u_max)² + {ERROR_PRICE:g} xᵀx) dt{scaled}",
     )
     made: dict[str, Objective] = {
         "energy": energy,

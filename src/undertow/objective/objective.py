@@ -30,6 +30,7 @@ from undertow.base import (
     raised_at,
 )
 from undertow.models import (
+    Coordinate,
     FloatArray,
     Mechanism,
     by_names,
@@ -287,17 +288,19 @@ def travel_box(mechanism: Mechanism, but: Container[str] = ()) -> tuple[Constrai
                 remedy="Move the target into it, or let the objective have travel=False",
             )
         low, high = TRAVEL * c.low, TRAVEL * c.high
-        factor, unit = (180 / math.pi, "°") if c.unit == "rad" else (1.0, f" {c.unit}")
-        ends = [f"{factor * end:.4g}{unit}" for end in (low, high)]
-        if low == -high:
-            name = f"|{c.name}| ≤ {ends[1]}"
-        else:
-            name = f"{ends[0]} ≤ " * math.isfinite(low) + c.name
-            name += f" ≤ {ends[1]}" * math.isfinite(high)
         source = f"{100 * TRAVEL:g} % of the travel that {mechanism.name} declares"
-        within = _Within(index, low, high)
+        name, within = range_words(c, low, high), _Within(index, low, high)
         found.append(Constraint(name, within, c.unit, c.name, source, declared=True))
     return tuple(found)
+
+
+def range_words(c: Coordinate, low: float, high: float) -> str:
+    """Return a range of a coordinate, rad or m, in words: ``|phi| ≤ 20°``, ``-1 m ≤ x ≤ 2 m``."""
+    factor, unit = (180 / math.pi, "°") if c.unit == "rad" else (1.0, f" {c.unit}")
+    ends = [f"{factor * end:.4g}{unit}" for end in (low, high)]
+    if low == -high:
+        return f"|{c.name}| ≤ {ends[1]}"
+    return f"{ends[0]} ≤ " * math.isfinite(low) + c.name + f" ≤ {ends[1]}" * math.isfinite(high)
 
 
 def check_travel(mechanism: Mechanism, name: str, low: float, high: float, shown: str) -> None:

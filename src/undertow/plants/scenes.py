@@ -39,7 +39,7 @@ def mujoco_scene(mechanism: Mechanism) -> Scene:
     Raises InvalidInputError for a mechanism that is not of the library, whatever it is called.
     """
     own = (
-        "Bring an MJCF file of your own: undertow.models.importers.from_mjcf(FILE), and "
+        "Bring an MJCF file of your own: undertow.modelling.from_mjcf(FILE), and "
         "MuJoCoRig(scene=FILE) or undertow run --rig FILE.xml"
     )
     one_of("MuJoCo scene", mechanism.name, _SCENES, own)

@@ -419,8 +419,7 @@ class Recipe:
             known = [item.name for item in fields(made) if item.name not in ("design", "estimator")]
             for name in given:
                 one_of(f"field of a log's {made.__name__}", name, known, _ANOTHER_VERSION)
-        if isinstance(limits := settings.get("output_limit"), list):
-            settings["output_limit"] = tuple(limits)
+        settings |= {name: tuple(v) for name, v in settings.items() if isinstance(v, list)}
         target: Any = taken.get("target", ())
         if len(target) == 2 and target[0] == MOVING:
             target = reference_from(target[1])

@@ -9,7 +9,7 @@ import numpy as np
 
 from undertow.base import check_fields, checked_names, one_for_each, positive
 from undertow.models import FloatArray, Mechanism
-from undertow.objective import TRAVEL, Objective, state_box
+from undertow.objective import TRAVEL, Objective, range_words, state_box
 
 
 @checked_names
@@ -52,9 +52,9 @@ class Settings:
     min_margin
         det Γ(q)/det Γ(0) below which the law is taken to be lost, (37).
     max_travel
-        Largest |q_i|, rad or m, besides the ranges of the coordinates: where a run is stopped.
-        Plans keep within 95 % of it, as of the ranges; free angles beyond ``fall_angle`` have
-        fallen before.  A bound makes first searches four to ten times as long.
+        Largest |q_i|, rad or m, for all coordinates or one for each, besides their ranges: where a
+        run is stopped.  Plans keep within 95 % of it, as of the ranges; free angles beyond
+        ``fall_angle`` have fallen before.  A bound makes first searches four to ten times as long.
     fall_angle
         A free angle further than this from the target has fallen, rad; with a swing-up one further
         than 60° in any case.
@@ -94,7 +94,7 @@ class Settings:
     sensor_settling_time: float = 0.02
     settled_radius: float = 0.2
     min_margin: float = 0.02
-    max_travel: float = math.inf
+    max_travel: float | tuple[float, ...] = math.inf
     fall_angle: float = math.pi / 2
     max_state_norm: float = 500.0
     max_step_interval: float = 0.1
@@ -131,13 +131,15 @@ class Settings:
         To 95 % of it, as to those of the travel that a mechanism declares; free angles only where
         they have not fallen before.
         """
-        boxes, source = [], f"{100 * TRAVEL:g} % of Settings(max_travel={self.max_travel:g})"
+        boxes, source = [], f"{100 * TRAVEL:g} % of the max_travel of the run"
+        most = self._most_travel(mechanism).tolist()
         for i, (low, high) in enumerate((TRAVEL * self.travels(mechanism)).tolist()):
             c = mechanism.coordinates[i]
             falls = self.fall_angle if i >= mechanism.m and c.unit == "rad" else math.inf
-            if self.max_travel < min(max(-c.low, c.high), falls):
+            if most[i] < min(max(-c.low, c.high), falls):
                 (box,) = state_box(**{c.name: (low, high)})
-                boxes.append(replace(box, unit=c.unit, source=source))
+                named = range_words(c, low, high)
+                boxes.append(replace(box, name=named, unit=c.unit, source=source))
         constraints = (*objective.constraints, *boxes)
         return replace(objective, constraints=constraints) if boxes else objective
 
@@ -151,7 +153,13 @@ class Settings:
         return np.where(np.isfinite(limits), self.dead_band * limits, 0.0)
 
     def travels(self, mechanism: Mechanism) -> FloatArray:
-        """Lowest and highest positions, (n, 2), rad or m."""
-        low = [max(c.low, -self.max_travel) for c in mechanism.coordinates]
-        high = [min(c.high, self.max_travel) for c in mechanism.coordinates]
-        return np.column_stack([low, high])
+        """Lowest and highest positions, (n, 2), rad or m.
+
+        Raises InvalidInputError where there is not one ``max_travel`` for each coordinate.
+        """
+        low, high = zip(*((c.low, c.high) for c in mechanism.coordinates), strict=True)
+        most = self._most_travel(mechanism)
+        return np.column_stack([np.maximum(low, -most), np.minimum(high, most)])
+
+    def _most_travel(self, mechanism: Mechanism) -> FloatArray:
+        return one_for_each("max_travel", self.max_travel, mechanism.n, infinite=True)

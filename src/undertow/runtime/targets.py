@@ -104,7 +104,8 @@ def checked_legs(
                 f"target of '{mechanism.name}' at {begin + motion.t[k]:g} s",
                 value=f"{name} = {motion.q[k, i]:.4g} {unit}",
                 limit=f"between {low[i]:g} and {high[i]:g} {unit}, where a run stops",
-                remedy="Choose a target further inside, or a larger Settings(max_travel=...)",
+                remedy="Choose a target further inside, or a larger Settings(max_travel=...), "
+                "--travel of undertow run",
             )
     return legs
 

@@ -138,7 +138,7 @@ def voltage_driven(mechanism: Mechanism, motors: DCMotor | Mapping[str, DCMotor]
     InvalidInputError
         For a motor on an input that does not exist.
     ModelError
-        When an input is in volts already.
+        When an input is in volts already, or in kN or the like, in which no motor's data are.
     """
     names = [i.name for i in mechanism.inputs]
     each = dict.fromkeys(names, motors) if isinstance(motors, DCMotor) else motors
@@ -160,12 +160,12 @@ def voltage_driven(mechanism: Mechanism, motors: DCMotor | Mapping[str, DCMotor]
         if given.name not in chosen:
             continue
         motor = chosen[given.name]
-        if given.unit == "V":
+        if given.unit not in ("N m", "Nm", "N", ""):
             raise ModelError(
                 f"input '{given.name}' of '{mechanism.name}'",
-                value="in V already",
-                limit="a torque or a force",
-                remedy="Put a motor on a torque-driven mechanism",
+                value="in V already" if given.unit == "V" else f"in {given.unit}",
+                limit="a torque in N m or a force in N, as a motor's data are",
+                remedy="Put a motor on a mechanism that these drive",
             )
         data = _parameters(given.name, motor)
         parameters += data.values()

@@ -29,7 +29,7 @@ from undertow.models.mechanism import (
     energies,
     matrix_of,
 )
-from undertow.models.quantities import number_of
+from undertow.models.quantities import in_degrees, number_of
 from undertow.models.validity import by_names, check_parts, check_symbols, expression_of, vocabulary
 from undertow.symbolic import Tape, compile_numpy
 
@@ -140,25 +140,28 @@ def from_matrices(
         source=source,
     )
     if equilibrium:
-        check_balanced(mechanism)
+        check_balanced(mechanism, equilibrium)
     return mechanism
 
 
-def check_balanced(mechanism: Mechanism) -> None:
+def check_balanced(mechanism: Mechanism, given: Mapping[str, float]) -> None:
     """Refuse a target that is no equilibrium: f_u(0, 0) ≠ 0, which no input can balance.
 
-    Raises ModelError with the largest force and the coordinate that it acts on.
+    ``given``: the position that was given for it, rad or m; an angle of many turns was meant in
+    degrees. Raises ModelError with the largest force and the coordinate that it acts on.
     """
     n, m = mechanism.n, mechanism.m
     residual = np.abs(mechanism.f(np.zeros(2 * n))[m:])
     limit = AT_REST * force_scale(mechanism)
     if not residual.max() <= limit:
         worst = mechanism.coordinates[m + int(np.argmax(residual))].name
+        q = np.array([given.get(c.name, 0.0) for c in mechanism.coordinates])
+        turned = in_degrees(mechanism.coordinates, m, q)
         raise ModelError(
             f"target of '{mechanism.name}'",
             value=f"a force of {residual.max():.4g} on '{worst}', which no input balances",
             limit=f"an equilibrium, |f_u| ≤ {limit:.2g}",
-            remedy=nearest_equilibrium(mechanism, "add this to what was given"),
+            remedy=turned or nearest_equilibrium(mechanism, "add this to what was given"),
         )
 
 
@@ -172,7 +175,7 @@ def nearest_equilibrium(mechanism: Mechanism, then: str = "") -> str:
     if not (left <= AT_REST and np.abs(q).max() <= NEAR):
         return (
             f"No equilibrium was found within {NEAR} rad or m: give a guess to "
-            "undertow.models.importers.find_equilibrium(mechanism, ...)"
+            "undertow.modelling.find_equilibrium(mechanism, ...)"
         )
     free = zip(mechanism.coordinates, q, strict=True)
     named = ", ".join(f"{c.name}={float(v)!r}" for c, v in list(free)[mechanism.m :])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
@@ -16,7 +17,7 @@ from undertow.models.importers.tree import LARGEST
 from undertow.models.importers.xml_files import without_rounding
 from undertow.models.linearisation import AT_REST, controllability, force_scale, linearise
 from undertow.models.mechanism import FloatArray, Mechanism
-from undertow.models.quantities import number_of
+from undertow.models.quantities import in_degrees, number_of
 from undertow.models.validity import by_names
 
 
@@ -60,6 +61,11 @@ def find_equilibrium(mechanism: Mechanism, /, **guess: float) -> dict[str, float
     InvalidInputError
         For an unknown coordinate.
 
+    Warns
+    -----
+    UserWarning
+        Of a guess that puts a free angle more than a turn off zero: degrees, probably.
+
     Examples
     --------
     >>> import undertow as ut
@@ -67,7 +73,10 @@ def find_equilibrium(mechanism: Mechanism, /, **guess: float) -> dict[str, float
     >>> round(find_equilibrium(rig, phi=3.0)["phi"], 6)
     3.141593
     """
-    q, relative = _solved(mechanism, _positions(mechanism, guess), mechanism.m)
+    near = _positions(mechanism, guess)
+    if turned := in_degrees(mechanism.coordinates, mechanism.m, near):
+        warnings.warn(f"guess of an equilibrium: {turned}", stacklevel=3)  # who called this
+    q, relative = _solved(mechanism, near, mechanism.m)
     if not relative <= AT_REST:
         scale = force_scale(mechanism)
         raise ModelError(
@@ -386,7 +395,8 @@ def least_peak(mechanism: Mechanism, x: FloatArray) -> float:
     decay = np.exp(-np.outer(rates, t))
     part = (decay[:, :-1] - decay[:, 1:]) / rates[:, None]
     pushes = np.einsum("rk,ri->rki", part, modes.T @ lin.input * limits).reshape(len(rates), -1)
-    size = pushes.shape[1]
+    size, scale = pushes.shape[1], np.abs(pushes).max() or 1.0
+    pushes /= scale  # limits of any size are solved for alike
     equal = np.hstack([np.vstack([pushes.real, pushes.imag]), np.zeros((2 * len(rates), 1))])
     wanted = -np.hstack([(modes.T @ x).real, (modes.T @ x).imag])
     peak = np.vstack([np.hstack([sign * np.eye(size), -np.ones((size, 1))]) for sign in (1, -1)])
@@ -398,7 +408,7 @@ def least_peak(mechanism: Mechanism, x: FloatArray) -> float:
         b_eq=wanted,
         bounds=[(None, None)] * size + [(0, None)],
     )
-    return float(found.fun or 0.0) if found.status == 0 else 0.0
+    return float(found.fun or 0.0) / float(scale) if found.status == 0 else 0.0
 
 
 def _position(mechanism: Mechanism, q: FloatArray) -> str:
@@ -511,7 +521,7 @@ def move_target(mechanism: Mechanism, /, **equilibrium: float) -> Mechanism:
         start={},
         description="\n".join(filter(None, (mechanism.description, place))),
     )
-    check_balanced(moved)
+    check_balanced(moved, equilibrium)
     return moved
 
 

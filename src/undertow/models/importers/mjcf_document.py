@@ -162,7 +162,7 @@ def _check_numbers(root: ET.Element) -> None:
 
 def _freeze(root: ET.Element, frozen: Sequence[str]) -> None:
     """Take joints out, with what drives them."""
-    names = [joint.get("name", "") for joint in _joints(root)]
+    names = [name for joint in _joints(root) if (name := joint.get("name"))]
     for name in frozen:
         one_of("frozen joint", name, names, "Name joints as the file does")
     for tendon in root.iterfind("tendon/*"):

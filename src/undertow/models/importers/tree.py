@@ -18,8 +18,8 @@ WORLD = "world"
 
 #: What to do about a joint that leaves a body free.
 FREE_BASE = (
-    "A free base leaves infinitely many equilibria (Remark 3): fix it, or model the joint by "
-    "hinges and slides"
+    "A free base leaves infinitely many equilibria (Remark 3): freeze the joint by its name, "
+    "frozen=[NAME] or FILE:-NAME, or model it by hinges and slides"
 )
 
 Vector = tuple[float, float, float]

@@ -77,8 +77,8 @@ def match(
     _require(alike, f"parameters of '{name}'", ", ".join(sorted(present)), wanted, whose)
     changed = {k: v for k, v in own.parameters.items() if present[k] != v}
     for key, value in changed.items() if own_parameters else ():
-        what, limit = f"parameter '{key}' of '{name}'", f"{value:.17g}, the certificate's"
-        _require(False, what, f"{present[key]:.17g}", limit, AGAIN)
+        what, limit = f"parameter '{key}' of '{name}'", f"{value}, the certificate's"
+        _require(False, what, f"{present[key]}", limit, AGAIN)
     limits = tuple(i.limit for i in mechanism.inputs)
     wanted = f"{own.input_limits}, the certificate's"
     _require(limits == own.input_limits, f"input limits of '{name}'", limits, wanted)
@@ -110,9 +110,9 @@ def check_settings(certificate: Certificate, settings: Mapping[str, float]) -> N
     """
     for name, value in settings.items():
         stated = certificate.parameters.get(name)
-        limit = "one of the certificate's" if stated is None else f"{stated:.17g}, as proved"
+        limit = "one of the certificate's" if stated is None else f"{stated}, as proved"
         what = f"parameter '{name}' of the certificate"
-        _require(stated == value, what, f"{value:.17g}", limit, AGAIN)
+        _require(stated == value, what, f"{value}", limit, AGAIN)
 
 
 def verify(
