@@ -495,6 +495,17 @@ def test_the_exported_c_begins_with_the_layer_that_friction_asks_for(tmp_path: P
         assert code == wanted
 
 
+def test_a_surface_that_export_looks_for_is_said_with_its_cost(tmp_path: Path) -> None:
+    with short_searches():
+        words = ("--control", "one-time", "--out", str(tmp_path / "firmware"))
+        code, said, _ = run("export", "c", RIG, *words)
+    assert code == 0
+    written = re.search(r"\{\{(-1\.0, .*?)\}", (tmp_path / "firmware" / f"{RIG}.c").read_text())
+    assert written is not None
+    assert f"lambda_u={float(written[1].split(', ')[3]):.4g}" in said
+    assert re.search(r"predicted cost +0\.\d+ s", said)
+
+
 def test_a_verb_of_python_that_is_no_command_is_told_of() -> None:
     code, _, err = run("compare")
     assert code == 2

@@ -260,11 +260,17 @@ def _check_request(
 def _first_optimum(
     belief: Mechanism, objective: str, law: ReachingLaw, start: list[str] | None, seed: int
 ) -> Surface:
-    """Return the surface that is best from the start."""
-    loop = ClosedLoop(belief, objective_named(objective, belief, 60.0), reaching=law)
-    best = Optimiser(loop, seed=seed).require(parse_start(belief, start)).surface
-    assert best is not None  # require() raises otherwise
-    return best
+    """Return the surface that is best from the start, and say what it costs."""
+    from undertow.studies.motion import proposal_report
+
+    goal, x0 = objective_named(objective, belief, 60.0), parse_start(belief, start)
+    loop = ClosedLoop(belief, goal, reaching=law)
+    with progress_bar() as progress:
+        progress("searching for the best surface", 0.0)
+        proposal = Optimiser(loop, seed=seed).require(x0)
+    show(proposal_report(belief, goal, x0, proposal, loop.reaching))
+    assert proposal.surface is not None  # require() raises otherwise
+    return proposal.surface
 
 
 def _estimator(
