@@ -491,6 +491,8 @@ def test_motors_that_do_not_exist_are_refused() -> None:
     tonnes = replace(cart, inputs=(ut.Input("force", "kN", 0.1),), input_matrix=[[1000]])
     with pytest.raises(ModelError, match="got in kN, must be a torque in N m or a force in N"):
         modelling.voltage_driven(tonnes, motor)
+    dotted = replace(cart, inputs=(ut.Input("torque", "N·m", 100.0),))
+    assert modelling.voltage_driven(dotted, motor).inputs[0].unit == "V"
 
 
 # -- one's own mechanism ----------------------------------------------------------------------

@@ -160,7 +160,7 @@ def voltage_driven(mechanism: Mechanism, motors: DCMotor | Mapping[str, DCMotor]
         if given.name not in chosen:
             continue
         motor = chosen[given.name]
-        if given.unit not in ("N m", "Nm", "N", ""):
+        if given.unit not in ("N m", "Nm", "N·m", "N*m", "N.m", "N", ""):
             raise ModelError(
                 f"input '{given.name}' of '{mechanism.name}'",
                 value="in V already" if given.unit == "V" else f"in {given.unit}",
