@@ -112,7 +112,7 @@ class Sampled:
             return
         rows = [*self._rows, (t, x, self._u)]
         times, states, inputs = (np.array(column) for column in zip(*rows, strict=True))
-        self.known = self.belief.learn(self.known, times, states, inputs)
+        self.known = self.belief.learn(self.known, times, states, inputs, held=True)
         names, values = tuple(self.belief.tolerances), self.belief.values(self.known.offset)
         places = [p.name for p in self.belief.mechanism.parameters]
         self.control.values = np.array([values[places.index(name)] for name in names])

@@ -65,6 +65,24 @@ def test_a_cascade_learns_the_plant(pendulum: ut.Mechanism) -> None:
     assert control.u == pytest.approx(asked.u)
 
 
+def test_a_cascade_whose_input_is_held_learns_so(
+    pendulum: ut.Mechanism, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the plant is the model nothing is learnt from it that is not so."""
+    cascade = replace(learning(pendulum, ut.MinimumTime(horizon=6.0)), cold=ut.Budget(128))
+    cascade = replace(cascade, zoh_steps=1, belief=ut.Belief.usual(pendulum))
+    seen, learn = [], ut.Belief.learn
+
+    def noted(*given: object, **named: bool) -> ParameterEstimate:
+        seen.append(learn(*given, **named))  # type: ignore[arg-type]
+        return seen[-1]
+
+    monkeypatch.setattr(ut.Belief, "learn", noted)
+    cascade.simulate(phi=0.5, duration=0.1)
+    assert seen
+    assert max(np.abs(estimate.offset).max() for estimate in seen) < 0.01
+
+
 @pytest.mark.slow
 def test_a_discontinuous_law_arrives_in_least_time_on_a_plant_to_be_learnt() -> None:
     """As soon as the continuous law, about: its inputs show as well what the plant is."""

@@ -13,6 +13,7 @@ import undertow as ut
 from undertow.base import InvalidInputError
 from undertow.cascade import Admission, CascadeState
 from undertow.cascade.simulation import legs_to, moments
+from undertow.closed_loop import Event, Trajectory
 from undertow.closed_loop.along_reference import simulate_along
 from undertow.law import ReferenceMotion
 from undertow.models import FloatArray
@@ -58,6 +59,16 @@ def leg(run: ut.Run, begin: float, end: float) -> float:
     """The cost of a run between two times."""
     t, cost = run.trajectory.t, run.trajectory.accumulated_cost
     return float(np.interp(end, t, cost) - np.interp(begin, t, cost))
+
+
+def test_a_run_that_stayed_at_its_target_does_not_say_that_it_arrived_at_the_end() -> None:
+    """Its cost has come to rest by then; of one that ends on arrival it has not."""
+    t = np.linspace(0.0, 8.0, 5)
+    x, one = np.zeros((5, 2 * CRANE.n)), np.ones((5, 1))
+    for last, when in ((2.0, "by"), (3.0, "at")):
+        cost = np.array([0.0, 1.0, 2.0, 2.0, last])
+        motion = Trajectory(CRANE, t, x, one, one, cost, one[:, 0], Event.REACHED, "s")
+        assert f"reached {when} 8 s, cost {last:g}," in repr(ut.Run(motion, ()))
 
 
 @pytest.mark.slow

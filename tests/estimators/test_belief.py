@@ -302,3 +302,24 @@ def test_nothing_is_learnt_from_rows_out_of_order(t: list[float]) -> None:
     belief = Belief.relative(ut.mechanisms.rotary_pendulum(), m=0.2)
     with pytest.raises(InvalidInputError, match="times of a motion to learn from"):
         belief.learn(belief.prior, t, np.zeros((2, 4)), np.zeros((2, 1)))
+
+
+def test_of_a_held_input_nothing_is_learnt_that_is_not_so(belief: Belief) -> None:
+    """SciPy integrates from one sample to the next; taken as straight, an input comes too early."""
+    rig = belief.mechanism
+    times = np.arange(0.0, 0.401, 0.002)
+    u = 5.0 * np.sin(7.0 * times) + 4.0 * np.sin(45.0 * times + 1.0)
+    states = [np.array([0.0, 0.4, 0.0, 1.0])]
+    for held in u[:-1]:
+
+        def rate(_: float, x: FloatArray, held: float = held) -> FloatArray:
+            return np.concatenate([x[2:], rig.accelerations(0.0, x, [held])])
+
+        states.append(solve_ivp(rate, (0, 0.002), states[-1], rtol=1e-10, atol=1e-10).y[:, -1])
+    motion = times, np.array(states), u[:, None]
+    learnt = belief.learn(belief.prior, *motion, held=True)
+    assert learnt.samples == len(times) - 1
+    assert np.abs(learnt.offset).max() < 0.01
+    assert np.abs(belief.learn(belief.prior, *motion).offset).max() > 0.05
+    t, x, v = (np.repeat(part[:1], 3, axis=0) for part in motion)  # no time passes
+    assert belief.learn(belief.prior, t, x, v) is belief.prior

@@ -256,3 +256,11 @@ def test_seeds_and_options_that_are_none_are_refused() -> None:
         with pytest.raises(InvalidInputError, match="options of reset"):
             env.reset(options=[0.3])  # type: ignore[arg-type]
     assert (many.reset(seed=7)[0] == many.reset(seed=[7, 8])[0]).all()
+
+
+def test_an_input_that_the_bench_cannot_give_is_not_paid_for() -> None:
+    """Its motor takes 3 V of the 15 that are asked for."""
+    bench = Bench(RIG.with_input_limit(3.0))
+    env = ut.environment(RIG, ut.MinimumEnergy(), realistic=bench)
+    env.reset(seed=0)
+    assert env.step(np.array([1.0]))[1] == pytest.approx(-(3.0**2) * env.task.period)

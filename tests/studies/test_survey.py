@@ -158,6 +158,23 @@ def test_table_and_files_say_what_was_found() -> None:
     assert not re.search(r"nan|inf\b", "".join(f.decode() for f in files.values()))
 
 
+def test_what_does_not_arrive_counts_in_the_median() -> None:
+    """Claim: it is worse than any that does; without a bound, or one of 0, there is no gap."""
+    lost = [made(name, time=math.inf, cascade=math.inf) for name in "bc"]
+    words = "Gap of the cascade to the bound: median {}, worst not reached."
+    assert words.format("20.0 %") in survey.summary([made("a"), made("d", 0.2), lost[0]])
+    assert words.format("not reached") in survey.summary([made("a"), *lost])
+    assert math.isnan(made("there", cascade=0.0, bound=0.0).gap)
+
+
+@pytest.mark.slow
+def test_a_start_inside_the_terminal_set_costs_nothing() -> None:
+    """Claim: its line is one of the table; the cart of the TORA begins within 5 cm."""
+    pytest.importorskip("casadi")
+    line = entry("tora", bounds=True, goal="bench-energy")
+    assert line.cascade == line.bound == line.time == 0
+
+
 def test_survey_on_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Claim: one command prints the table, here of a line of ours, and leaves it as files."""
     line = made(PROMPT, start="phi = 35°")

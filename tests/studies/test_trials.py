@@ -217,6 +217,17 @@ def test_a_law_in_the_place_of_what_makes_one_is_refused_at_once(arm: ut.Mechani
     assert len(made.rows) == 1
 
 
+def test_an_input_that_the_plant_cannot_give_costs_nothing(arm: ut.Mechanism) -> None:
+    """A weak motor takes 3 V of the 15 that are asked for."""
+    made = ut.compare(
+        arm, [lambda start: lambda t, x: np.array([15.0])], plants=[arm.with_input_limit(3.0)],
+        objective=ut.MinimumEnergy(), seconds=0.01, phi=0.1,
+    )  # fmt: skip
+    (outcome,) = made.outcomes.values()
+    assert outcome.cost == pytest.approx(3.0**2 * 0.01)
+    assert outcome.effort == pytest.approx(3.0**2 * 0.01)
+
+
 def test_a_run_that_ends_before_its_arm_is_home_is_not_called_lost(arm: ut.Mechanism) -> None:
     """Free coordinates home, the arm out and coming nearer: not yet; going away or still: no."""
     t = np.arange(0.0, 4.0, 0.001)

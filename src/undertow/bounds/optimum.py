@@ -198,9 +198,9 @@ def bound(
     objective = objective.on(mechanism)
     start = mechanism.initial_state(x0, state)
     longest = _check(mechanism, objective, start, horizon, intervals)
-    given = recorded(mechanism, guess)
     if float(np.linalg.norm(start)) <= objective.terminal_radius:
         return _bound(mechanism, _at_target(mechanism, start), began)
+    given = recorded(mechanism, guess)
     casadi = require_extra("casadi", "bounds", "optimal-control bounds need CasADi")
     programme = Programme(casadi, mechanism, objective, start, longest)
     candidates: list[Solution] = []

@@ -376,7 +376,9 @@ class Cascade:
         return known is not None and its is not None and its.tolerances == known.tolerances
 
     @checked
-    def learn(self, state: CascadeState, t: ArrayLike, x: ArrayLike, u: ArrayLike) -> CascadeState:
+    def learn(
+        self, state: CascadeState, t: ArrayLike, x: ArrayLike, u: ArrayLike, held: bool = False
+    ) -> CascadeState:
         """Return the state with what a recorded piece of motion shows of the plant.
 
         Parameters
@@ -385,10 +387,12 @@ class Cascade:
             Memory of the cascade.
         t, x, u
             Times, (N,), s; states, (N, 2n); inputs after the actuator, (N, m).
+        held
+            Whether the input is held from row to row; it runs straight otherwise.
         """
         if self.known is None or state.estimate is None:
             return state
-        return replace(state, estimate=self.known.learn(state.estimate, t, x, u))
+        return replace(state, estimate=self.known.learn(state.estimate, t, x, u, held))
 
     def __repr__(self) -> str:
         """Show what is controlled, for what, and how often it is planned anew."""
@@ -707,7 +711,7 @@ class Cascade:
                 progress(0.0, legs[-1].end)
             pieces.append(simulate_piece(self, truth, memory, x, t, span, leg.stays))
             motion = pieces[-1]
-            memory = self.learn(memory, motion.t, motion.x, motion.u)
+            memory = self.learn(memory, motion.t, motion.x, motion.u, held=self.zoh_steps > 0)
             x, spent, arrived = motion.x[-1], spent + motion.cost, motion.event == Event.REACHED
             if progress is not None:
                 progress(t + span, legs[-1].end)

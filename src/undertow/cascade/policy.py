@@ -183,15 +183,11 @@ class _CascadeEpisode:
         return objective.horizon
 
     def _learnt(self, memory: CascadeState) -> CascadeState:
-        """Return the memory with what the motion since the last time shows of the plant.
-
-        Inputs are taken to run straight from row to row: of one that is held, the mean of before
-        and after is what it is at a row.
-        """
+        """Return the memory with what the motion since the last time shows of the plant."""
         x, u = np.array(self._x), np.array(self._u)
         t = (self._k - len(x) + np.arange(len(x))) * self._period
         self._x, self._u = self._x[-1:], self._u[-1:]
-        return self._cascade.learn(memory, t, x, 0.5 * (np.vstack([u[:1], u[:-1]]) + u))
+        return self._cascade.learn(memory, t, x, u, held=True)
 
 
 @checked

@@ -98,10 +98,17 @@ class Run:
         """Show how it ended."""
         admitted = sum(update.admission.accepted for update in self.updates)
         return (
-            f"Run({self.trajectory.mechanism.name}, {self.trajectory.ending} at "
-            f"{self.time:.4g} s, cost {self.cost:.6g}, {len(self.updates)} decisions, "
-            f"{admitted} admitted)"
+            f"Run({self.trajectory.mechanism.name}, {self._end}, cost {self.cost:.6g}, "
+            f"{len(self.updates)} decisions, {admitted} admitted)"
         )
+
+    @property
+    def _end(self) -> str:
+        """How and when it ended, in words: a target where it stayed was reached before the end."""
+        motion = self.trajectory
+        stayed = (np.diff(motion.t[-2:]) > 0) & (np.diff(motion.accumulated_cost[-2:]) == 0)
+        when = "by" if self.reached and stayed.any() else "at"
+        return f"{motion.ending} {when} {self.time:.4g} s"
 
     @property
     def cost(self) -> float:
@@ -110,12 +117,16 @@ class Run:
 
     @property
     def time(self) -> float:
-        """Time at which the terminal set was reached, or the run ended, s."""
+        """Time at the end, s: of a run that stays at its target, later than when it arrived.
+
+        A run stays that follows a reference, or goes to set-points for a ``duration``; any other
+        ends where it reaches the terminal set.
+        """
         return self.trajectory.time
 
     @property
     def reached(self) -> bool:
-        """Whether the terminal set was reached."""
+        """Whether it ended in the terminal set."""
         return self.trajectory.event == Event.REACHED
 
     def plot(self) -> MotionFigure:
@@ -125,8 +136,7 @@ class Run:
         """
         motion = self.trajectory
         cost = f"{self.cost:.4g} {motion.cost_unit}".strip()
-        end = f"{motion.ending} at {self.time:.4g} s"
-        figure = motion.plot(f"{motion.mechanism.name}: {end}, cost {cost}")
+        figure = motion.plot(f"{motion.mechanism.name}: {self._end}, cost {cost}")
         figure.axes[-1].set_xlabel("time (s); dotted: another surface takes over")
         for before, update in itertools.pairwise(self.updates):
             if update.surface != before.surface:

@@ -403,7 +403,12 @@ class Belief:
 
     @checked
     def learn(
-        self, estimate: ParameterEstimate, t: ArrayLike, x: ArrayLike, u: ArrayLike
+        self,
+        estimate: ParameterEstimate,
+        t: ArrayLike,
+        x: ArrayLike,
+        u: ArrayLike,
+        held: bool = False,
     ) -> ParameterEstimate:
         """Return what is known after a recorded piece of motion.
 
@@ -414,6 +419,8 @@ class Belief:
         t, x, u
             Times, (N,), s; states, (N, 2n); inputs after the actuator, (N, m).  Between two rows
             the input runs straight from one to the other.
+        held
+            True: it keeps the value of the first row until the next, as that of a sampled law does.
 
         Returns
         -------
@@ -443,8 +450,11 @@ class Belief:
                 limit="numbers that do not fall",
                 remedy="Put the rows in the order in which they were",
             )
-        if rows < 2 or not self.tolerances:
+        if rows < 2 or motion[0][-1] == motion[0][0] or not self.tolerances:
             return estimate
+        if held:  # a row before and one after each jump of the input
+            times, states = (np.repeat(part, 2, axis=0)[1:-1] for part in motion[:2])
+            motion = times, states, np.repeat(motion[2][:-1], 2, axis=0)
         box, contradictions = None, estimate.contradictions
         if self.bound is not None:
             box = self._narrowed(*self._box(estimate), *motion)
@@ -570,8 +580,9 @@ class Belief:
             offset, last = _within(offset, information, pull, low, high), offset
             if np.abs(offset - last).max() < ENOUGH:
                 break
-        samples = before.samples + len(t) - 1
-        return ParameterEstimate(offset, information, samples), float(np.median(rest**2))
+        moved = np.diff(t) > 0
+        samples = before.samples + int(moved.sum())
+        return ParameterEstimate(offset, information, samples), float(np.median(rest[moved] ** 2))
 
     def _changes(
         self, offsets: FloatArray, t: FloatArray, x: FloatArray, u: FloatArray

@@ -291,7 +291,12 @@ class BenchPlant:
         return self._rig.truth
 
     def step(self, u: FloatArray) -> tuple[float, float]:
-        """Hold inputs, (m,), for a period: its cost by the trapezoidal rule, and the margin."""
+        """Hold inputs, (m,), for a period: its cost by the trapezoidal rule, and the margin.
+
+        Of an input counts what the bench's actuator can give.
+        """
+        limits = self._bench.mechanism.input_limits
+        u = np.clip(u, -limits, limits)
         rates = [self._rate(u)[0]]
         for _ in range(self._samples):
             self._rig.write(u)

@@ -75,13 +75,17 @@ class Entry:
 
     @property
     def gap(self) -> float:
-        """What the cascade spends beyond the bound, relative; NaN without a bound."""
-        return self.cascade / self.bound - 1.0
+        """What the cascade spends beyond the bound, relative; NaN without a bound above 0."""
+        return _gap(self.cascade, self.bound)
 
     @property
     def free_gap(self) -> float:
         """The same for the cascade with a free reaching law."""
-        return self.free / self.bound - 1.0
+        return _gap(self.free, self.bound)
+
+
+def _gap(cost: float, bound: float) -> float:
+    return cost / bound - 1.0 if bound > 0 else math.nan
 
 
 def survey(
@@ -217,8 +221,8 @@ def _cycles(mechanism: Mechanism, horizon: float) -> float:
 
 
 def median_gap(gaps: Iterable[float]) -> float:
-    """Return the median of the gaps that are known; NaN where none is."""
-    known = [gap for gap in gaps if math.isfinite(gap)]
+    """Return the median of the gaps that are known, one that did not arrive infinite; or NaN."""
+    known = [gap for gap in gaps if not math.isnan(gap)]
     return median(known) if known else math.nan
 
 
@@ -298,11 +302,10 @@ def summary(entries: Sequence[Entry]) -> list[str]:
         ("the cascade with a free reaching law", [entry.free_gap for entry in entries]),
     ):
         middle = median_gap(gaps)
-        if math.isfinite(middle):
-            most = max(gap for gap in gaps if not math.isnan(gap))
-            lines.append(
-                f"Gap of {words} to the bound: median {_percent(middle)}, worst {_percent(most)}."
-            )
+        if not math.isnan(middle):
+            worst = max(gap for gap in gaps if not math.isnan(gap))
+            said = (_percent(g) if math.isfinite(g) else "not reached" for g in (middle, worst))
+            lines.append("Gap of {} to the bound: median {}, worst {}.".format(words, *said))
     return lines + _problems(entries)
 
 

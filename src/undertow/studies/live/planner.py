@@ -58,7 +58,7 @@ def planner(mechanism: Mechanism, seed: int = 0) -> Callable[[Request], Answer]:
         controller, memory = cascade(request.task), request.memory
         if request.seen is not None and len(request.seen[0]) > 1:
             try:
-                memory = controller.learn(memory, *request.seen)
+                memory = controller.learn(memory, *request.seen, held=True)
             except (ArithmeticError, ValueError, np.linalg.LinAlgError):
                 memory = request.memory  # motions of a plant that fell may be anything
         return respond(controller, replace(request, memory=memory))

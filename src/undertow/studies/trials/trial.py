@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -49,7 +49,8 @@ class Result:
     free ones were, wherever the driven ones had got to. ``settled``: time after which every
     coordinate stayed home, s; infinite if one did not. ``cost``: of the objective, along the true
     motion with the inputs written; NaN without one. ``effort``: ∫ uᵀu dt. ``chatter``: total
-    variation of the inputs per second, in their unit.
+    variation of the inputs per second, in their unit. Of an input counts what the plant's actuator
+    can give.
     """
 
     seed: int
@@ -108,6 +109,8 @@ def trial(
         estimator = estimator_for(belief, told or bench, known=Belief.usual(belief))
     rig = RealisticRig(bench, x0, seed)
     record = run_trial(belief, rig, estimator, make, seconds, compensates)
+    limits = bench.mechanism.input_limits
+    record = replace(record, u=np.clip(record.u, -limits, limits))
     pushed = max((push.t for push in bench.pushes), default=-math.inf)
     return judge(belief, record, seed, objective, home, pushed)
 
