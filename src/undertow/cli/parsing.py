@@ -66,14 +66,12 @@ def parse_travels(mechanism: Mechanism, words: Sequence[str] | None) -> tuple[fl
     >>> parse_travels(ut.mechanisms.cart_pendulum(), ["x=0.3m"])
     (0.3, inf)
     """
-    most = {c.name: math.inf for c in mechanism.coordinates}
+    declared = {c.name: c for c in mechanism.coordinates}
+    most = dict.fromkeys(declared, math.inf)
     for name, text in _pairs(words, f"{next(iter(most))}=LIMIT").items():
         one_of(f"coordinate of '{mechanism.name}'", name, most)
-        units = _units_of(mechanism, name, "travel")
-        example = f"--travel {name}={_bare(text, '1')}{units[0]}"
-        number, unit = _quantity(text, units, f"travel of '{name}'", example)
-        most[name] = number * UNITS[unit][2]
-        own = next(c for c in mechanism.coordinates if c.name == name)
+        most[name] = _in_si(mechanism, name, text, "travel of", "--travel", "1")
+        own = declared[name]
         farthest = max(-own.low, own.high)
         remedy = f"The mechanism has no more: it declares {own.low:g} to {own.high:g} {own.unit}"
         between(f"travel of '{name}'", most[name], 0.0, farthest, own.unit, remedy)
@@ -237,6 +235,14 @@ def _bare(text: str, other: str) -> str:
     return match[1] if match and not match[2] else other
 
 
+def _in_si(mechanism: Mechanism, name: str, text: str, what: str, option: str, usual: str) -> float:
+    """Return what an ``option`` says of a coordinate or a rate; ``usual``: an example's number."""
+    units = _units_of(mechanism, name, what)
+    example = f"{option} {name}={_bare(text, usual)}{units[0]}"
+    number, unit = _quantity(text, units, f"{what} '{name}'", example)
+    return number * UNITS[unit][2]
+
+
 def parse_start(mechanism: Mechanism, words: Sequence[str] | None) -> FloatArray:
     """Read an initial state from ``name=value`` words with units; the rest is zero.
 
@@ -254,10 +260,7 @@ def parse_start(mechanism: Mechanism, words: Sequence[str] | None) -> FloatArray
         return mechanism.usual_start
     values: dict[str, float] = {}
     for name, text in _pairs(words, f"{mechanism.coordinates[-1].name}=40deg").items():
-        units = _units_of(mechanism, name, "initial state")
-        example = f"--start {name}={_bare(text, '10')}{units[0]}"
-        number, unit = _quantity(text, units, f"initial state '{name}'", example)
-        values[name] = number * UNITS[unit][2]
+        values[name] = _in_si(mechanism, name, text, "initial state", "--start", "10")
     return mechanism.state(**values)
 
 
