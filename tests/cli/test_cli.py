@@ -736,6 +736,8 @@ def test_surface_words_of_several_inputs() -> None:
     surface = parse_surface(pair, text)
     np.testing.assert_array_equal(surface.lambda_a, [[-2, 0.5], [0, -3]])
     np.testing.assert_array_equal(surface.alpha_a, -np.eye(2))
+    for printed in (str(surface), repr(surface), str(surface).replace(", ", ",\n ")):
+        assert parse_surface(pair, printed) == surface
     with pytest.raises(InvalidInputError, match="not equally long"):
         parse_surface(pair, "lambda_a=-2,0.5;0 alpha_u=1;2 lambda_u=4;5")
     with pytest.raises(InvalidInputError, match="'lambda_a' twice"):

@@ -332,7 +332,7 @@ def test_screens_fit_80_columns() -> None:
     ]
     console = Console(width=80, record=True, file=io.StringIO())
     for shown in (
-        run_table(report, 1e-3, "N m", simulated=False),
+        run_table(report, 1e-3, [], simulated=False),
         fault_injection.drill_table([], live),
         fault_injection.kill_table(killed),
         fault_injection.systematic_table(hard),
@@ -342,6 +342,17 @@ def test_screens_fit_80_columns() -> None:
     assert max(map(len, text.splitlines())) <= 80
     assert "…" not in text
     assert "9 times read: OSError" in text
+
+
+def test_chattering_of_each_input_is_in_its_own_unit() -> None:
+    """The units were sorted, the numbers not: a torque stood there as a force."""
+    from undertow.runtime import Report
+    from undertow.studies.rigs.runs import run_table
+
+    report = Report(steps=500, total_variation=np.array([1.5, 9.0]))
+    console = Console(width=200, record=True, file=io.StringIO())
+    console.print(run_table(report, 1e-3, ["N m", "N"], simulated=True))
+    assert "3 N m/s, 18 N/s of total variation" in console.export_text()
 
 
 def test_a_systematic_fault_that_is_none_is_refused() -> None:

@@ -99,7 +99,8 @@ SurfaceText = Annotated[
     option(
         "--surface",
         "A surface of your own: 'lambda_a=-0.5 alpha_u=5 lambda_u=10'; commas between "
-        "entries of a row, semicolons between rows; alpha_a is -1 if not given.",
+        "entries of a row, semicolons between rows, or as it is printed; alpha_a is -1 if not "
+        "given.",
         metavar="BLOCKS",
     ),
 ]

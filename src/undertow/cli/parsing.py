@@ -395,7 +395,8 @@ def parse_surface(mechanism: Mechanism, text: str) -> Surface:
     """Read a surface from its blocks; α_a is −I where it is not given.
 
     ``"lambda_a=-0.5 alpha_u=5 lambda_u=10"``; entries of a row are joined by commas, rows by
-    semicolons. A block of another size than the mechanism's is refused, with one that has it.
+    semicolons. What prints as a surface is one, too: ``alpha_a=-1, lambda_a=[[-1.0, 0.0], …``. A
+    block of another size than the mechanism's is refused, with one that has it.
     """
     blocks: dict[str, FloatArray] = {"alpha_a": -np.eye(mechanism.m)}
     driven, free = mechanism.m, mechanism.n - mechanism.m
@@ -406,7 +407,10 @@ def parse_surface(mechanism: Mechanism, text: str) -> Surface:
         for name, columns in sizes.items()
     }
     example = " ".join(f"{name}={block}" for name, block in sample.items() if name != "alpha_a")
-    for name, value in _pairs(text.split(), example).items():
+    bare = text.strip().removeprefix("Surface(").removesuffix(")")
+    bare = re.sub(r"\]\s*,\s*\[", ";", bare).translate({ord(c): None for c in "[]"})
+    bare = re.sub(r"\s*([,;])\s*(?![^\W\d])", r"\1", bare)  # within a block: no name follows
+    for name, value in _pairs(re.sub(r",\s", " ", bare).split(), example).items():
         one_of("surface block", name, sizes)
         rows = [
             [_number(v, f"surface block {name}") for v in r.split(",")] for r in value.split(";")

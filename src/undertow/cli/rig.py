@@ -215,11 +215,11 @@ def run(
         what = "simulated time" if simulated else f"optimiser in another {worker}"
         what += ", the rig in a supervisor" if supervisor else ""
         where = f"the {rig} rig" if rig in ("ideal", "realistic", "mujoco") else rig
-        unit = ", ".join(sorted({i.unit for i in belief.inputs}))
+        units = [i.unit for i in belief.inputs]
         show(
             f"{name} on {where}, {1 / period:g} Hz, {what}",
             problem_words(belief, recipe.cascade.objective, recipe.cascade.gate),
-            run_table(report, period, unit, simulated=simulated),
+            run_table(report, period, units, simulated=simulated),
         )
         if (written := runtime.log) is not None:
             lost = f", {written.dropped:,} rows lost" if written.dropped else ""

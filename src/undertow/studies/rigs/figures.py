@@ -102,7 +102,7 @@ def _exceedance(values: FloatArray) -> tuple[FloatArray, FloatArray]:
 def chatter_figure(recording: Recording) -> Figure:
     """Draw the total variation of each input in windows of ``WINDOW`` s."""
     _, inputs, _ = Columns.shown(recording.columns)
-    period, unit, total = float(recording.meta["period"]), _unit(recording), 0.0
+    period, units = float(recording.meta["period"]), recording.meta.get("units", {})
     count = max(1, round(WINDOW / period))
     figure = Figure(figsize=(8, 3.2), layout="constrained")
     ax = figure.subplots()
@@ -110,11 +110,12 @@ def chatter_figure(recording: Recording) -> Figure:
         steps = np.abs(np.diff(recording[name], prepend=0.0))
         whole = len(steps) // count * count
         variation = steps[:whole].reshape(-1, count).sum(axis=1) / (count * period)
-        total += float(steps.sum())
-        ax.step(recording["t"][:whole:count], variation, where="post", label=name, lw=1)
+        unit = units.get(name, "")
+        label = f"{name}, {unit or 1}/s: {f'{steps.sum():.4g} {unit}'.rstrip()} in all"
+        ax.step(recording["t"][:whole:count], variation, where="post", label=label, lw=1)
     ax.set(
-        xlabel="time, s", ylabel=f"total variation, {unit or 1}/s", yscale="symlog",
-        title=f"chattering: {f'{total:.4g} {unit}'.rstrip()} in all, in windows of {WINDOW:g} s",
+        xlabel="time, s", ylabel="total variation of each input", yscale="symlog",
+        title=f"chattering, in windows of {WINDOW:g} s",
     )  # fmt: skip
     ax.set_ylim(bottom=0)
     ax.legend(loc="upper right")

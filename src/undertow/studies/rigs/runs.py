@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from rich.console import Group
 from rich.table import Table
@@ -46,11 +46,11 @@ def _histogram(whole: Histogram) -> Table:
     return table(("due to written", "steps", ""), rows, left=("",), ruled=True)
 
 
-def run_table(report: Report, period: float, unit: str, *, simulated: bool) -> Group:
+def run_table(report: Report, period: float, units: Sequence[str], *, simulated: bool) -> Group:
     """Return what came of a run: deadlines, times, states, answers, chattering.
 
-    ``period`` is that of the fast loop, s, ``unit`` that of the inputs; of simulated time no times
-    are shown.
+    ``period`` is that of the fast loop, s, ``units`` are those of the inputs; of simulated time no
+    times are shown.
     """
     rows = [("steps", f"{report.steps:,}")]
     if not simulated:
@@ -82,10 +82,13 @@ def run_table(report: Report, period: float, unit: str, *, simulated: bool) -> G
         rows.append(("readings missing", f"in {report.steps_with_missing_readings:,} steps"))
     verdicts = ", ".join(f"{count} {verdict}" for verdict, count in report.answers.most_common())
     seconds = max(1, report.steps) * period
-    variation = ", ".join(f"{v / seconds:.4g}" for v in report.total_variation)
+    variation = ", ".join(
+        f"{v / seconds:.4g} {unit or 1}/s"
+        for v, unit in zip(report.total_variation, units, strict=True)
+    )
     rows += [
         ("answers of the optimiser", verdicts or "none"),
-        ("chattering", f"{variation} {unit or 1}/s of total variation"),
+        ("chattering", f"{variation} of total variation"),
     ]
     lines = facts(rows)
     lines.columns[0].max_width = 24
