@@ -392,10 +392,12 @@ def _designing(mechanism: Mechanism, what: str, given: Sequence[object]) -> Iter
 def placed_surface(mechanism: Mechanism, poles: Sequence[complex]) -> Surface:
     """Design a surface whose sliding dynamics have the given 2n − m eigenvalues, 1/s.
 
+    Complex ones come with their conjugates, and none more than m times.
+
     Raises
     ------
     InvalidInputError
-        For a wrong number of poles or poles that are not left of the imaginary axis.
+        For other poles, a wrong number of them, and poles not left of the imaginary axis.
     ModelError
         When (A, B) is not controllable.
     """
@@ -407,6 +409,13 @@ def placed_surface(mechanism: Mechanism, poles: Sequence[complex]) -> Surface:
             "poles of the sliding dynamics",
             value=list(poles),
             limit=f"{free} finite numbers with negative real part",
+        )
+    if np.unique_counts(wanted).counts.max() > m:
+        raise InvalidInputError(
+            "poles of the sliding dynamics",
+            value=list(poles),
+            limit=f"each at most {m} times, as many as there are inputs",
+            remedy="Move equal ones a little apart: -3, -3.1, -3.2",
         )
     import scipy.signal  # slow to import, and needed here alone
 

@@ -52,7 +52,7 @@ class Linearisation:
 
     @property
     def A(self) -> FloatArray:
-        """State matrix of ẋ = A x + B u with x = (q, q̇), (2n, 2n)."""
+        """State matrix of ẋ = A x + ``input`` u with x = (q, q̇), (2n, 2n)."""
         n = len(self.M)
         lower = np.linalg.solve(self.M, np.hstack([self.F, self.D]))
         return np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), lower])
@@ -69,7 +69,7 @@ class Linearisation:
 
     @property
     def input(self) -> FloatArray:
-        """Input matrix of ẋ = A x + B u, (2n, m)."""
+        """Input matrix of ẋ = ``A`` x + ``input`` u, (2n, m)."""
         n, m = len(self.M), len(self.B)
         force = np.vstack([self.B, np.zeros((n - m, m))])
         return np.vstack([np.zeros((n, m)), np.linalg.solve(self.M, force)])
