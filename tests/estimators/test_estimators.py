@@ -302,6 +302,10 @@ def test_measured_velocities_need_no_estimator(arm: ut.Mechanism) -> None:
     np.testing.assert_array_equal(record.x, record.truth)
     with pytest.raises(InvalidInputError, match="positions only"):
         Measured(arm).estimate(Measurement(0.0, np.zeros(2)), np.zeros(1))
+    estimator, wrong = Measured(arm), np.array([np.nan, np.inf])
+    estimator.reset([0.1, 0.2, 0.3, 0.4])
+    x = estimator.estimate(Measurement(0.0, np.array([0.5, -np.inf]), wrong), np.zeros(1))
+    np.testing.assert_array_equal(x, [0.5, 0.2, 0.3, 0.4])
 
 
 def test_senseless_settings_are_refused(arm: ut.Mechanism) -> None:

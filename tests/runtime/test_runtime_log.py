@@ -6,6 +6,7 @@ import contextlib
 import errno
 import itertools
 import json
+import math
 import multiprocessing
 import os
 import shutil
@@ -27,8 +28,10 @@ import sympy as sp
 import undertow as ut
 from undertow.base import ArtefactError, ResourceError, UndertowError
 from undertow.cascade import CascadeState
-from undertow.estimators import KalmanFilter
+from undertow.estimators import KalmanFilter, Measured
 from undertow.law import Plan
+from undertow.plants import Measurement
+from undertow.plants.interface import RigWrapper
 from undertow.runtime import (
     Columns,
     InlineWorker,
@@ -83,6 +86,25 @@ def test_the_replay_of_a_run_is_the_run_bit_for_bit(logged: Path) -> None:
     assert result.judged >= 4
     assert result.gap is None
     np.testing.assert_array_equal(result.u[:, 0], result.recording["voltage"])
+
+
+def test_velocities_that_were_lost_are_lost_in_the_replay(tmp_path: Path) -> None:
+    """A step without any came back as of a rig that measures none, which ``Measured`` refuses."""
+
+    class Lossy(RigWrapper):
+        def read(self) -> Measurement:
+            measured = super().read()
+            assert measured.v is not None
+            lost = math.nan if round(1e3 * measured.t) % 10 < 3 else 1.0
+            return Measurement(measured.t, measured.q, lost * measured.v)
+
+    recipe = replace(RECIPE, rig="ideal", estimator=lambda model, _: Measured(model))
+    controller, path = recipe.make_controller(MEMORY), tmp_path / "lossy.db"
+    worker = InlineWorker(lambda request: respond(recipe.cascade, request))
+    with Log(path, COLUMNS, about(controller, recipe), threaded=False) as log:
+        rig, clock = Lossy(recipe.make_rig()), SimulatedClock()
+        assert Runtime(controller, rig, worker, clock=clock, log=log).run(0.1).steps > 90
+    assert replay(path, estimator=recipe.estimator, decisions=False).identical
 
 
 @pytest.mark.parametrize("column", ["phi_measured", "voltage", "theta_dot"])

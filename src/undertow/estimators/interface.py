@@ -154,7 +154,7 @@ class Measured(Estimator):
         self._x[:] = x0
 
     def estimate(self, measurement: Measurement, u: FloatArray) -> FloatArray:
-        """Return the measured state; what is NaN keeps its last value."""
+        """Return the measured state; what is no finite number keeps its last value."""
         if measurement.v is None:
             raise InvalidInputError(
                 "measurement",
@@ -166,7 +166,7 @@ class Measured(Estimator):
         copy_numbers(measurement.v, self._v, "measured v")
         for i in range(n):
             for place, value in ((i, q[i]), (n + i, self._v[i])):
-                if not np.isnan(value):
+                if math.isfinite(value):
                     self._x[place] = value
         return self._x
 

@@ -130,12 +130,19 @@ class Columns:
         row[self.step_us] = 1e6 * (at.computed - at.read)
         row[self.write_us] = 1e6 * (at.written - at.computed)
 
-    def measurement(self, row: FloatArray) -> Measurement | None:
-        """Return the measurement of a step; ``None`` where the rig had failed."""
+    def measures_velocities(self, rows: FloatArray) -> bool:
+        """Whether any of the rows has a measured velocity: then one that is NaN was lost."""
+        return not np.isnan(rows[:, self.v]).all()
+
+    def measurement(self, row: FloatArray, *, velocities: bool) -> Measurement | None:
+        """Return the measurement of a step; ``None`` where the rig had failed.
+
+        ``velocities``: whether the rig measures them.
+        """
         if math.isnan(row[self.rig_t]) and np.isnan(row[self.q]).all():
             return None
-        v = row[self.v]
-        return Measurement(float(row[self.rig_t]), row[self.q], None if np.isnan(v).all() else v)
+        v = row[self.v] if velocities else None
+        return Measurement(float(row[self.rig_t]), row[self.q], v)
 
     def agrees(self, row: FloatArray, controller: Controller) -> bool:
         """Whether a controller is, bit for bit, where the step of a row had left it."""

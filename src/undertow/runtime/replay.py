@@ -263,6 +263,7 @@ def _replayed(recording: Recording, controller: Controller, *, decisions: bool) 
         answers[row["k"]].append(answer_from(row, controller.reference))
     said: dict[tuple[int, str], str] = {(k, kind): text for k, _, kind, text in recording.events}
     columns = Columns.of(mechanism)
+    velocities = columns.measures_velocities(recording.steps)
     outputs: list[FloatArray] = []
     differing, first, gap = 0, None, None
     judged = misjudged = 0
@@ -274,7 +275,7 @@ def _replayed(recording: Recording, controller: Controller, *, decisions: bool) 
         command = Command[said.get((k, "command"), "NONE")]
         inputs = Inputs(
             float(row[columns.t]),
-            columns.measurement(row),
+            columns.measurement(row, velocities=velocities),
             arrived[0] if arrived else None,
             command,
             said.get((k, "alarm"), ""),
