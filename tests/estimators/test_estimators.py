@@ -308,6 +308,19 @@ def test_measured_velocities_need_no_estimator(arm: ut.Mechanism) -> None:
     np.testing.assert_array_equal(x, [0.5, 0.2, 0.3, 0.4])
 
 
+def test_a_velocity_that_stays_away_is_no_state(arm: ut.Mechanism) -> None:
+    """Its last value was taken for ever, and a run on it thrown out a second later."""
+    estimator, none = Measured(arm), np.full(2, np.nan)
+    for q, v in ((np.zeros(2), none), (none, none), (np.zeros(2), np.zeros(2))) * 2:
+        for k in range(20):
+            estimator.estimate(Measurement(1e-3 * k, q, v), np.zeros(1))
+    lost = Measurement(0.1, np.zeros(2), np.array([0.0, np.nan]))
+    for _ in range(20):
+        estimator.estimate(lost, np.zeros(1))
+    with pytest.raises(InvalidInputError, match=r"_dot: got no number for 0\.021 s"):
+        estimator.estimate(lost, np.zeros(1))
+
+
 def test_senseless_settings_are_refused(arm: ut.Mechanism) -> None:
     for make in (
         lambda: FilteredDerivative(arm, time_constant=0.0),

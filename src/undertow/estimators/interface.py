@@ -139,19 +139,25 @@ MakeEstimator: TypeAlias = Callable[[Mechanism, Bench], Estimator]
 class Measured(Estimator):
     """No estimator at all: for rigs that measure velocities too.
 
+    ``longest_gap``: how long a velocity may be missing while its position comes, s.
+
     Raises
     ------
     InvalidInputError
-        At the first measurement without velocities.
+        At the first measurement without velocities, and when one is missing for longer.
     """
 
-    def __init__(self, mechanism: Mechanism, period: float = 0.001) -> None:
+    def __init__(
+        self, mechanism: Mechanism, period: float = 0.001, longest_gap: float = 0.02
+    ) -> None:
         super().__init__(mechanism, period)
         self._x, self._v = np.zeros(2 * mechanism.n), np.zeros(mechanism.n)
+        self._missed, self._longest = [0] * mechanism.n, longest_gap
 
     def reset(self, x0: ArrayLike) -> None:
         """Start again from the state x0, (2n,)."""
         self._x[:] = x0
+        self._missed = [0] * self.mechanism.n
 
     def estimate(self, measurement: Measurement, u: FloatArray) -> FloatArray:
         """Return the measured state; what is no finite number keeps its last value."""
@@ -168,6 +174,17 @@ class Measured(Estimator):
             for place, value in ((i, q[i]), (n + i, self._v[i])):
                 if math.isfinite(value):
                     self._x[place] = value
+            if math.isfinite(self._v[i]):
+                self._missed[i] = 0
+            elif math.isfinite(q[i]):
+                self._missed[i] += 1
+                if self._missed[i] * self.period > self._longest + 1e-9:
+                    raise InvalidInputError(
+                        f"measured {self.mechanism.state_names[n + i]}",
+                        value=f"no number for {self._missed[i] * self.period:g} s",
+                        limit=f"one in {self._longest:g} s",
+                        remedy="Look at its sensor, or use undertow.estimators.KalmanFilter",
+                    )
         return self._x
 
 
