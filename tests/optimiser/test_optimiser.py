@@ -18,6 +18,7 @@ import undertow as ut
 from support import rest_slow
 from undertow.base import InfeasibleError, InvalidInputError
 from undertow.optimiser.proposal import Proposal, motion_margins
+from undertow.optimiser.task import Optimisation
 from undertow.studies.paper import CASES
 
 OBJECTIVES = {"energy": ut.MinimumEnergy(), "time": ut.MinimumTime()}
@@ -489,6 +490,45 @@ def test_what_suits_every_plant_is_found_near_what_is_best_for_one() -> None:
     first = next(cascade.optimiser.improve(start))
     assert first.plan is not None
     assert cascade.loop.batch(start, first.plan).reached[0]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "rotary_pendulum",
+        pytest.param("double_pendulum_on_a_cart", marks=pytest.mark.slow),
+        pytest.param("reaction_wheel_pendulum", marks=pytest.mark.slow),
+    ],
+)
+def test_for_many_plants_far_and_wide_is_searched_on_one(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As good as a search far and wide on all of them, with a quarter of its rollouts there."""
+    mechanism = ut.mechanisms.LIBRARY[name]()
+    optimiser, start = ut.Cascade(mechanism).optimiser, mechanism.usual_start
+    assert optimiser.loop.ensemble is not None
+    quick = optimiser.propose(start)
+    monkeypatch.setattr(Optimisation, "for_one_plant", lambda _: None)
+    wide = optimiser.propose(start)
+    assert quick.cost <= 1.01 * wide.cost  # what a confidence is about
+    assert 4 * quick.evaluations < wide.evaluations
+
+
+def test_the_first_of_many_plants_alone_is_an_ensemble_of_one(rig: ut.Mechanism) -> None:
+    """With its own errors, whatever it weighs: it costs what a loop with it as the plant costs."""
+    values = np.array([[p.value for p in rig.parameters]] * 3) * [[1.05], [1.0], [0.95]]
+    tilted = np.array([[0.0, 0.02, 0.0, 0.0], [0.0, 0.3, 0.0, 0.0], np.zeros(4)])
+    many = ut.closed_loop.Ensemble(
+        rig, values, weights=np.array([0.0, 1.0, 1.0]), state_errors=tilted
+    )
+    loop = ut.ClosedLoop(rig, OBJECTIVES["energy"], ensemble=many.first)
+    start, surface = rig.state(phi=0.1), ut.Surface(-1, -0.5, 5, 10)
+    assert len(many.first) == 1
+    named = dict(zip((p.name for p in rig.parameters), values[0], strict=True))
+    other = ut.ClosedLoop(rig, OBJECTIVES["energy"], plant=rig.with_parameters(**named))
+    assert loop.batch(start, surface).cost[0] == pytest.approx(
+        other.batch(start + tilted[0], surface).cost[0], rel=1e-9
+    )
 
 
 def test_a_gentle_start_is_a_linear_feedback(rig: ut.Mechanism) -> None:

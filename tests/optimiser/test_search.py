@@ -199,8 +199,8 @@ def test_refuses_unusable_settings(mean: list[float], sigma: float, population: 
         CMAES(np.array(mean), sigma, population, np.random.default_rng(0))
 
 
-@pytest.mark.parametrize("members", [None, 17])
-def test_a_descent_on_many_plants_ends_where_it_gains_no_more(members: int | None) -> None:
+@pytest.mark.parametrize("plants", [1, 17])
+def test_a_descent_on_many_plants_ends_where_it_gains_no_more(plants: int) -> None:
     """A pause ends it there, but for one on the way to a first plan that arrives; alone it goes on.
 
     The spread of a descent along a valley is no sign that it is done: on 17 plants each generation
@@ -217,14 +217,13 @@ def test_a_descent_on_many_plants_ends_where_it_gains_no_more(members: int | Non
 
     task = SimpleNamespace(
         optimiser=SimpleNamespace(population=8, counts_time=False),
-        loop=SimpleNamespace(ensemble=None if members is None else range(members)),
         rng=np.random.default_rng(5), cost=cost, resolution=0.0, warm=False, left=8 * 200,
-        late=lambda: False,
+        plants=plants, late=lambda: False,
     )  # fmt: skip
     converged = _descend(cast(Any, task), np.full(3, 5.0), 1.0, 8 * 200, 0.0)
     generations = len(spent) / 8
     assert min(spent) < INADMISSIBLE
-    if members is None:
+    if plants == 1:
         assert (generations, converged) == (200, False)
     else:
         assert (generations, converged) == (46 + LONG_PAUSE, True)

@@ -8,7 +8,7 @@ inadmissible, and the cost is a risk measure over the members.  Searches and gat
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, get_args
 
@@ -114,6 +114,17 @@ class Ensemble:
         """The weights, their sum 1, (K,)."""
         weights = self.weights if len(self.weights) else np.ones(len(self))
         return np.asarray(weights / weights.sum(), dtype=np.float64)
+
+    @property
+    def first(self) -> Ensemble:
+        """The first member alone."""
+        return replace(
+            self,
+            values=self.values[:1],
+            weights=np.empty(0),
+            surface_errors=self.surface_errors[:1],
+            state_errors=self.state_errors[:1],
+        )
 
     def __len__(self) -> int:
         """Return the number of members."""

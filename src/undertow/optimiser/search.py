@@ -3,7 +3,9 @@
 A global search first improves the best of some quadratic designs, which is an answer already, and
 then looks elsewhere: for a smooth cost by descents from the best of many draws, for the time of
 arrival by :mod:`undertow.optimiser.arrival`.  Of a smooth cost the best single surface comes first,
-where there may be several one after another: its copies are what they are improved from.
+where there may be several one after another: its copies are what they are improved from.  Where
+a plan has to suit many plausible plants, a smooth cost is searched far and wide for one of them, at
+a fraction of the time, and its minima are improved for all.
 
 What independent random starts of a global search lead to is kept: it tells how likely its answer
 is the best one, see :mod:`undertow.optimiser.confidence`.  For a smooth cost these are descents of
@@ -30,6 +32,7 @@ from undertow.law import Plan, stability_margin
 from undertow.models import FloatArray
 from undertow.optimiser.arrival import SHORTER, ArrivalSearch
 from undertow.optimiser.cma_es import CMAES, minimise
+from undertow.optimiser.confidence import confidence
 from undertow.optimiser.proposal import Budget
 from undertow.optimiser.schedules import WIDE, WORTHWHILE, follow_earliest, lead_back
 from undertow.optimiser.switching import SwitchingSurfaces
@@ -56,6 +59,9 @@ RESTARTS, TRIED, TERMS = 11, 64, 24
 #: Where a rollout is one on each of many plants: so many generations that together gain less than
 #: this part of the cost end a descent.
 LONG_PAUSE, SLOW = 40, 1e-4
+
+#: Confidence below which what searches with a model found is improved without one, too.
+AGREED = 0.5
 
 #: Widest spread of a first population along a ridge.
 FAR = 0.25
@@ -104,7 +110,7 @@ def _descend(
     smooth = not task.optimiser.counts_time
     resolution = task.resolution if smooth else 0.0
     pause: dict[str, Any] = {}
-    if smooth and task.loop.ensemble is not None and not (task.warm or resolution):
+    if smooth and task.plants > 1 and not (task.warm or resolution):
         pause = {"relative": SLOW, "patience": LONG_PAUSE, "below": INADMISSIBLE}
     minimise(
         search,
@@ -166,7 +172,7 @@ def _own_search(task: Optimisation) -> Iterator[bool]:
     if task.optimiser.counts_time:
         done = _along_ridge(task, min(POLISH, task.left))
         if not task.best_cost < INADMISSIBLE:
-            if task.loop.ensemble is None:
+            if task.plants == 1:
                 _descend_from_draws(task, ALONE, 3 * ALONE)
             else:
                 _near_one_plant(task)
@@ -183,26 +189,19 @@ def _own_search(task: Optimisation) -> Iterator[bool]:
         if again:
             yield from follow_earliest(task)
         return
+    one = None
     if task.centre.size <= MODEL_SIZE:
         _model_search(task, task.centre)
         if not task.best_cost < INADMISSIBLE:
-            _near_one_plant(task)
+            one = _near_one_plant(task)
         yield False
-    optimiser, rng, total = task.optimiser, task.rng, task.evaluations + task.left
-    draws = max(optimiser.population, total // 6)
-    drawn, costs = zip(*_draws(task, draws), strict=True)
-    z, scores = np.vstack([z, *drawn]), np.concatenate([scores, *costs])
-    if not scores.min() < UNSTABLE:  # not one that may be rolled out: nothing to go by
-        yield False
-        return
-    starts = z[np.argsort(scores, kind="stable")[:3]]
-    share = (total - len(z)) // 4
-    for start in starts:
-        _descend(task, start, 0.3, share, 3e-3)
-    converged = _descend(task, task.centre, 0.03, share, 1e-4)
-    while task.left >= optimiser.population and not task.late():
-        start = task.centre + task.space.steps(rng, np.ones(1))[0]
-        _descend(task, start, 0.3, task.left, 3e-3)
+    one = one or _near_one_plant(task)
+    if one is not None and 0 < one.best_cost < INADMISSIBLE and task.best_cost < INADMISSIBLE:
+        if not several:
+            task.kept = 0
+        converged = _go_on_from(task, one)
+    else:
+        converged = _search_everywhere(task, z, scores)
     if not several and task.kept:
         task.kept = 0
         _restart(task)
@@ -211,6 +210,45 @@ def _own_search(task: Optimisation) -> Iterator[bool]:
         task.kept = 0
         task.switch_at(_division(task))
         yield _descend(task, task.centre, 0.1, task.left, 1e-4)
+
+
+def _search_everywhere(task: Optimisation, z: FloatArray, scores: FloatArray) -> bool:
+    """Descend from the best of many draws, and of what was scored before."""
+    optimiser, rng, total = task.optimiser, task.rng, task.evaluations + task.left
+    draws = max(optimiser.population, total // 6)
+    drawn, costs = zip(*_draws(task, draws), strict=True)
+    z, scores = np.vstack([z, *drawn]), np.concatenate([scores, *costs])
+    if not scores.min() < UNSTABLE:  # not one that may be rolled out: nothing to go by
+        return False
+    starts = z[np.argsort(scores, kind="stable")[:3]]
+    share = (total - len(z)) // 4
+    for start in starts:
+        _descend(task, start, 0.3, share, 3e-3)
+    converged = _descend(task, task.centre, 0.03, share, 1e-4)
+    while task.left >= optimiser.population and not task.late():
+        start = task.centre + task.space.steps(rng, np.ones(1))[0]
+        _descend(task, start, 0.3, task.left, 3e-3)
+    return converged
+
+
+def _go_on_from(task: Optimisation, one: Optimisation) -> bool:
+    """Improve for all plausible plants each minimum that a search for one plant found.
+
+    Where each leads to counts as often as the minimum was found.  A bound that some plants meet
+    misleads models: where they disagree, the best is improved without one.
+    """
+    if task.centre.size > MODEL_SIZE:
+        return _descend(task, task.centre, 0.03, task.left, 1e-4)
+    assert one.best is not None  # an admissible one
+    converged = True
+    for found, times in one.found or [(one.best, 1)]:
+        search = _model_search(task, task.space.encode(found))
+        converged &= search.converged
+        if search.best_f < INADMISSIBLE:
+            task.minima += times * [search.best_f]
+    if (confidence(task.minima) or 0.0) < AGREED:
+        return _descend(task, task.centre, 0.03, task.left, 1e-4)
+    return converged
 
 
 def _draws(task: Optimisation, count: int) -> Iterator[tuple[FloatArray, FloatArray]]:
@@ -224,22 +262,25 @@ def _draws(task: Optimisation, count: int) -> Iterator[tuple[FloatArray, FloatAr
         yield z, task.cost(z)
 
 
-def _near_one_plant(task: Optimisation) -> None:
+def _near_one_plant(task: Optimisation) -> Optimisation | None:
     """Look near what is best for one plant, the estimate, for what suits every plausible one.
 
     That takes a fraction of the time, and what suits all may be near it: a motion that goes up to
-    the singularity (37) on one plant is past it on the next.
+    the singularity (37) on one plant is past it on the next.  Returns the search for one plant.
     """
     one = task.for_one_plant()
     if one is None or task.late():
-        return
+        return None
     for _ in _own_search(one):
         pass
     task.take_time_of(one)
     if one.best is not None and one.best_cost < INADMISSIBLE:
+        here = task.space.encode(one.best)
+        task.cost(here[None])
         for spread in (0.1, 0.3, 0.03):
             if not task.best_cost < INADMISSIBLE:
-                _descend(task, task.space.encode(one.best), spread, min(ALONE, task.left), 1e-3)
+                _descend(task, here, spread, min(ALONE, task.left), 1e-3)
+    return one
 
 
 def _descend_from_draws(task: Optimisation, draws: int, share: int) -> None:
@@ -286,11 +327,15 @@ def _restart(task: Optimisation) -> None:
         if cost < INADMISSIBLE:
             ends.append((here, cost))
     parts = np.linspace(0.0, 1.0, LANES + 2)[1:-1, None]
-    task.minima.append(task.best_cost)
-    for here, cost in ends:
-        between = task.cost(task.centre + parts * (here - task.centre))
-        valley = between.max() <= (1.0 + WORTHWHILE) * cost
-        task.minima.append(task.best_cost if valley else cost)
+    others, here = [], task.centre
+    for there, cost in ends:
+        between = task.cost(here + parts * (there - here))
+        if between.max() > (1.0 + WORTHWHILE) * cost:
+            others.append((there, cost))
+    same = 1 + len(ends) - len(others)
+    task.minima += same * [task.best_cost] + [cost for _, cost in others]
+    task.found = [(task.space.plan(z), 1) for z, _ in others]
+    task.found.insert(0, (task.space.plan(here), same))
 
 
 def _division(task: Optimisation) -> tuple[float, ...]:
@@ -443,7 +488,7 @@ def _arrive_earlier(task: Optimisation, wide: bool = False, keep: int = 0) -> bo
         lambda evaluations: task.left < evaluations + keep or task.late(),
     )
     freedom = task.optimiser.freedom
-    single = wide and freedom.reaching and not freedom.schedule and task.loop.ensemble is None
+    single = wide and freedom.reaching and not freedom.schedule and task.plants == 1
     most = 1
     if task.optimiser.aims:
         most = LESS_FRUITLESS if single else FRUITLESS

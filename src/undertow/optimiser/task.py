@@ -79,6 +79,7 @@ class Optimisation:
         self.unit = unit
         self.began = self._last = time.perf_counter()
         self.optimiser, self.loop, self.space = optimiser, optimiser.loop, optimiser.space
+        self.plants = 1 if self.loop.ensemble is None else len(self.loop.ensemble)
         self.x, self.horizon, self.budget = x, horizon, budget
         self.resolution, self.sequence, self.warm = resolution, sequence, warm
         self.rng = np.random.default_rng([optimiser.seed, sequence])
@@ -94,6 +95,7 @@ class Optimisation:
         self.asking = 0
         self.promised, self.usual = math.inf, False
         self.minima: list[float] = []
+        self.found: list[tuple[Plan, int]] = []  # minima, and how often each was found
         self._buffers: dict[int, RolloutBuffers] = {}
 
     # -- budget ----------------------------------------------------------------------------
@@ -129,18 +131,24 @@ class Optimisation:
         return self._from_cold(optimiser, most)
 
     def for_one_plant(self) -> Optimisation | None:
-        """The task for the estimate alone, a single surface; ``None`` where there is no other."""
-        if self.loop.ensemble is None or len(self.loop.ensemble.values) == 1:
+        """The task for the first member alone, a single surface; ``None`` where it is the only one.
+
+        It may take half of what is left.
+        """
+        if self.plants == 1:
             return None
-        optimiser = self.optimiser.on(replace(self.loop, ensemble=None))
+        assert self.loop.ensemble is not None  # of which there are several
+        optimiser = self.optimiser.on(replace(self.loop, ensemble=self.loop.ensemble.first))
         if optimiser.space.segments > 1 or optimiser.freedom.schedule:
             assert optimiser.plainer is not None  # a single surface
             optimiser = optimiser.plainer
-        return self._from_cold(optimiser, self.budget.evaluations)
+        most = max(self.budget.evaluations, optimiser.usual_cold.evaluations)
+        half = self.left * self.plants // 2
+        return self._from_cold(optimiser, max(1, min(most, half)), 0.5)
 
-    def _from_cold(self, optimiser: Optimiser, evaluations: int) -> Optimisation:
-        """The task of another optimiser, from nothing, in the time that is left."""
-        left = max(self.budget.seconds - (time.perf_counter() - self.began), ANSWERING)
+    def _from_cold(self, optimiser: Optimiser, evaluations: int, part: float = 1.0) -> Optimisation:
+        """The task of another optimiser, from nothing, in a part of the time that is left."""
+        left = max(part * (self.budget.seconds - (time.perf_counter() - self.began)), ANSWERING)
         return Optimisation(
             optimiser, self.x, self.horizon, Budget(evaluations, left),
             resolution=self.resolution, sequence=self.sequence, warm=False,
@@ -148,8 +156,7 @@ class Optimisation:
 
     def take_time_of(self, one: Optimisation) -> None:
         """Count the evaluations of a task for one plant as what they are of this one's."""
-        assert self.loop.ensemble is not None  # else there is no such task
-        self.evaluations += one.evaluations // len(self.loop.ensemble.values)
+        self.evaluations += one.evaluations // self.plants
 
     def switch_at(self, times: tuple[float, ...]) -> None:
         """Search from now on for surfaces that take over at these times, s."""
