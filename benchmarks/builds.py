@@ -6,8 +6,9 @@ FOLDER is another checkout (``git worktree add FOLDER COMMIT``).  Each build wor
 its own, on one thread, with a cache of its own; they are asked in turn, in changing order, round
 after round.  A ratio is this build's seconds over the other's in one round; printed are its
 geometric mean and the 95 % interval of it.  Both must give the same costs, bit for bit, or the row
-says so.  Every fourth part of the rounds has a pair of new processes: where the system puts a
-process's memory moves its times by several per cent.
+says how far this build's is above the other's, as a part of it.  Every fourth part of the rounds
+has a pair of new processes: where the system puts a process's memory moves its times by several per
+cent.
 """
 
 from __future__ import annotations
@@ -65,6 +66,9 @@ def warm(name):
     ask = cascades[name].optimiser.propose
     return sum(ask(x, incumbent=surface, sequence=j).cost for j in range(20))
 
+def many():
+    return ut.Cascade(rig, ut.MinimumEnergy()).optimiser.propose(x0).cost
+
 for line in sys.stdin:
     job, *rest = line.split()
     began = time.perf_counter()
@@ -78,6 +82,7 @@ JOBS = {
     "re-optimisation, energy, cold": "cold energy",
     "re-optimisation, time, warm": "warm time",
     "re-optimisation, time, cold": "cold time",
+    "first plan, many plants": "many",
 }
 
 IMPORT = "import undertow"
@@ -206,12 +211,14 @@ def main() -> int:
             build.process.terminate()
         for name, took in seconds.items():
             mean, low, high = interval(took[new], took[old])
-            equal = results[name][new] == results[name][old]
-            same &= equal
+            ours, theirs = (results[name][build] for build in (new, old))
+            told = "same"
+            if ours != theirs:
+                same, told = False, f"{float.fromhex(ours) / float.fromhex(theirs) - 1:+.1e}"
             rows.append([
                 name, str(len(took[new])),
                 *(f"{1e3 * np.median(took[b]):.2f}" for b in (new, old)),
-                f"{mean:.3f}", f"{low:.3f} to {high:.3f}", "same" if equal else "DIFFER",
+                f"{mean:.3f}", f"{low:.3f} to {high:.3f}", told,
             ])  # fmt: skip
     header = ["", "rounds", "this, ms", "other, ms", "ratio", "95 % interval", "results"]
     table("this build against another, in turn, one thread", header, rows)

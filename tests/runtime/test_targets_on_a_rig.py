@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ import undertow as ut
 from runs import short_searches
 from undertow.base import InvalidInputError
 from undertow.law import ReferenceMotion
-from undertow.plants import IdealRig
+from undertow.plants import IdealRig, RealisticRig
 from undertow.runtime import Recipe, Request, Settings, session
 
 CRANE = ut.mechanisms.overhead_crane()
@@ -101,6 +102,46 @@ def test_the_delay_that_a_bench_measures_is_the_estimators_and_the_rigs() -> Non
     for recipe, periods in ((late, 5), (Recipe(rig="realistic"), 2)):
         estimator: Any = recipe.make_estimator()
         assert estimator._lead == periods
+
+
+FEW = {"theta": 2 * math.pi / 200, "phi": 2 * math.pi / 200}
+
+
+def test_encoders_of_few_counts_are_the_estimators_and_the_rigs() -> None:
+    """Of 200 counts a turn; through JSON values and back."""
+    told = Recipe.from_dict(Recipe(rig="realistic", encoders=FEW).as_dict())
+    assert [told.make_rig().bench.encoders[name].resolution for name in FEW] == [*FEW.values()]
+    usual, few = (recipe.make_estimator() for recipe in (Recipe(rig="realistic"), told))
+    spread, wide = (np.diag(e.steady_covariance())[:2] for e in (usual, few))
+    assert (wide > 10 * spread).all()
+
+
+@pytest.mark.slow
+def test_a_rig_with_few_counts_is_held_by_who_is_told() -> None:
+    """The paper's rig on 200 counts a turn; with 4096 taken for granted it is lost."""
+    model = ut.mechanisms.rotary_pendulum()
+    cascade, begins = ut.Cascade(model, cold=ut.Budget(512)), model.state(phi=0.35)
+    endings = []
+    for told in (FEW, None):
+        rig = RealisticRig(Recipe(rig="realistic", encoders=FEW).bench, begins, 0)
+        done = ut.run(cascade, rig, seconds=1.0, simulated=True, x0=begins, encoders=told)
+        endings.append(done.verdict.ending)
+    assert endings == ["caught", "lost"]
+
+
+@pytest.mark.parametrize(
+    ("encoders", "rig", "match"),
+    [
+        ({"psi": 0.01}, "realistic", "encoder of a run.*psi.*theta, phi"),
+        ({"phi": 0.0}, "realistic", "one count of 'phi'.*> 0"),
+        ({"phi": 0.01}, "ideal", "encoders of a run.*ideal rig"),
+    ],
+)
+def test_encoders_that_cannot_be_are_refused(
+    encoders: dict[str, float], rig: Any, match: str
+) -> None:
+    with pytest.raises(InvalidInputError, match=match):
+        Recipe(rig=rig, encoders=encoders)
 
 
 def test_a_target_is_refused_before_a_controller_is_made(monkeypatch: pytest.MonkeyPatch) -> None:

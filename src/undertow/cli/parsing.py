@@ -78,6 +78,22 @@ def parse_travels(mechanism: Mechanism, words: Sequence[str] | None) -> tuple[fl
     return tuple(most.values())
 
 
+def parse_encoders(mechanism: Mechanism, words: Sequence[str] | None) -> dict[str, float]:
+    """Return one count of each position sensor that words name, rad or m.
+
+    Examples
+    --------
+    >>> import undertow as ut
+    >>> parse_encoders(ut.mechanisms.cart_pendulum(), ["x=0.0001m"])
+    {'x': 0.0001}
+    """
+    names, counts = [c.name for c in mechanism.coordinates], {}
+    for name, text in _pairs(words, f"{names[0]}=COUNT").items():
+        one_of(f"coordinate of '{mechanism.name}'", name, names)
+        counts[name] = _in_si(mechanism, name, text, "one count of", "--encoder", "0.1")
+    return counts
+
+
 def aimed(name: str, target: Sequence[str] | None) -> tuple[str, list[str]]:
     """Move words that say at which equilibrium a file's mechanism rests into its name.
 

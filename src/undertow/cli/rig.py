@@ -23,6 +23,7 @@ from undertow.cli import options
 from undertow.cli.parsing import (
     aimed,
     mechanism_named,
+    parse_encoders,
     parse_limits,
     parse_new_target,
     parse_start,
@@ -56,6 +57,7 @@ if TYPE_CHECKING:
     "undertow run rotary_pendulum --seconds 60 --lead 0.02",
     "undertow run rotary_pendulum --rig realistic --start phi=30deg --log bench.db",
     "undertow run rotary_pendulum --rig realistic --limit voltage=5 --travel theta=90deg",
+    "undertow run rotary_pendulum --rig realistic --encoder phi=0.36deg --delay 0.002",
     "undertow run cart_pendulum --simulated --seconds 10 --log run.db",
     "undertow run overhead_crane --target x=0.5m --target x=-0.5m@8s --seconds 16",
     "undertow run rotary_pendulum --target theta=20deg@0.25Hz --seconds 20",
@@ -77,6 +79,7 @@ def run(
     known: Annotated[Literal["usual", "exact"], typer.Option("--belief")] = "usual",
     period: float = 0.001,
     delay: float | None = None,
+    encoder: list[str] | None = None,
     lead: float = 0.1,
     worker: Literal["process", "thread"] = "process",
     lockstep: bool = True,
@@ -120,6 +123,9 @@ def run(
     delay
         From a write to its effect in a reading, s, as undertow bench measures it; of any rig but
         ideal. Default: that of a usual bench, 1 ms; of the SRV02 1.5 ms.
+    encoder : COORDINATE=VALUE
+        One count of a position sensor, with units: phi=0.18deg is 2000 counts a turn, x=0.0001m; of
+        any rig but ideal. Repeatable. Default: those of a usual bench, 4096 counts a turn or 20 µm.
     lead
         Shortest time from a request to the optimiser until its answer is applied, s; it is
         increased when answers arrive late. A short one keeps the optimiser busy.
@@ -169,6 +175,7 @@ def run(
         seed=seed,
         period=period,
         delay=delay,
+        encoders=parse_encoders(belief, encoder),
         seconds=float("inf") if simulated else max(0.01, 0.3 * lead),
         settings=settings,
     )

@@ -344,6 +344,11 @@ class Bench:
         """Return the bench with a delay, s: three fifths at the inputs, two in the readings."""
         return self.with_timing(input_delay=0.6 * delay, measurement_delay=0.4 * delay)
 
+    def with_encoders(self, counts: Mapping[str, float]) -> Self:
+        """Return the bench with other encoders: one count of each that is named, rad or m."""
+        others = {name: Encoder(count) for name, count in counts.items()}
+        return replace(self, encoders={**self.encoders, **others})
+
 
 SRV02 = "Quanser, SRV02 Rotary Servo Base Unit User Manual: specifications"
 PENDULUM = "Quanser, SRV02 Rotary Pendulum User Manual: specifications"

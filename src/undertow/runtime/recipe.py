@@ -98,6 +98,9 @@ class Recipe:
     delay
         From a write to its effect in a reading, s, as ``undertow bench`` measures it: the estimator
         reckons with it, and a realistic rig has it.  By default the bench's own.
+    encoders
+        One count of a position sensor by coordinate, rad or m: the estimator reckons with it, and a
+        realistic rig has it.  By default the bench's own.
     swing_up
         Begin hanging at rest, where no other start is given, and swing up.
     target
@@ -137,6 +140,7 @@ class Recipe:
     seconds: float = math.inf
     period: float = 0.001
     delay: float | None = None
+    encoders: Mapping[str, float] = field(default_factory=dict)
     swing_up: bool = False
     target: tuple[tuple[float, Mapping[str, float]], ...] | Reference = ()
     duration: float = 60.0
@@ -162,13 +166,17 @@ class Recipe:
         check_fields(self)
         if self.delay is not None:
             positive("delay of a run, s", self.delay, "0.002 is 2 ms", zero=True)
-            if self.rig == "ideal":
-                raise InvalidInputError(
-                    "delay of a run",
-                    value=f"{self.delay:g} s, on an ideal rig",
-                    limit="a rig that has one: realistic, or your own driver",
-                    remedy="Leave it out",
-                )
+        for name, count in self.encoders.items():
+            one_of("encoder of a run", name, [c.name for c in self.belief.coordinates])
+            positive(f"one count of '{name}'", count, "2π/4096 is that of 4096 counts a turn")
+        told = {"delay": self.delay is not None, "encoders": bool(self.encoders)}
+        for what in (name for name in told if told[name] and self.rig == "ideal"):
+            raise InvalidInputError(
+                f"{what} of a run",
+                value=f"{getattr(self, what)}, on an ideal rig",
+                limit="a rig that has such: realistic, or your own driver",
+                remedy="Leave it out",
+            )
         stall = self.settings.max_step_interval
         if not SHORTEST <= self.period < stall:
             raise InvalidInputError(
@@ -352,6 +360,7 @@ class Recipe:
     def bench(self) -> Bench:
         """What the realistic rig is like."""
         usual = bench_for(self.belief).with_timing(period=self.period)
+        usual = usual.with_encoders(self.encoders)
         return usual if self.delay is None else usual.with_delay(self.delay)
 
     def make_rig(self) -> RealisticRig:

@@ -211,6 +211,7 @@ def run(
     target: Mapping[str, float] | Target | None = None,
     estimator: MakeEstimator | None = None,
     delay: float | None = None,
+    encoders: Mapping[str, float] | None = None,
     progress: Callable[[str, float], None] | None = None,
     **state: float,
 ) -> Report:
@@ -257,6 +258,9 @@ def run(
     delay
         From a write to its effect in a reading, s, as :func:`undertow.bring_up.bring_up` measures
         it; by default that of :func:`undertow.plants.bench.bench_for`.
+    encoders
+        One count of a position sensor by coordinate, rad or m: ``{"phi": 2 * math.pi / 2000}``; by
+        default that bench's, 4096 counts a turn or 20 µm.
     progress
         Called with (what, fraction) while the run is prepared.
 
@@ -286,6 +290,7 @@ def run(
             rig="ideal" if isinstance(rig, IdealRig) else "realistic",
             seed=cascade.seed,
             delay=delay,
+            encoders=encoders or {},
             period=0.001 if rig is None else rig.period,
             seconds=math.inf if simulated else max(0.01, 0.3 * settings.lead_time),
             target=() if target is None else _points(target),
