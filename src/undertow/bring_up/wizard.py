@@ -122,18 +122,18 @@ def bring_up(
     """
     if delay is not None:
         positive("delay of the loop as it should be, s", delay, "0.002 is 2 ms", zero=True)
-    wizard = _Wizard(rig, belief, rest_state(belief) if rest is None else rest)
-    progress("listening", 0.0)
+    wizard = _Wizard(rig, belief, rest_state(belief) if rest is None else rest, progress)
+    wizard.begin("listening", 0.0)
     if not wizard.listen():
         return wizard.result()
-    progress("small pushes", 0.1)
+    wizard.begin("small pushes", 0.1)
     if not wizard.push():
         return wizard.result()
-    progress("slow ramps", 0.25)
+    wizard.begin("slow ramps", 0.25)
     wizard.break_away()
     if not learn:
         return wizard.result()
-    progress("a longer motion", 0.3)
+    wizard.begin("a longer motion", 0.3)
     wizard.learn(delay, lambda what, part: progress(what, 0.35 + 0.65 * part))
     return wizard.result()
 
@@ -168,8 +168,9 @@ class _Driver(RigWrapper):
 class _Wizard:
     """The state of one bring-up: findings so far, the rig as it is understood."""
 
-    def __init__(self, rig: Rig, belief: Mechanism, rest: FloatArray) -> None:
+    def __init__(self, rig: Rig, belief: Mechanism, rest: FloatArray, progress: Progress) -> None:
         self.rig, self.belief, self.rest = _Driver(rig, belief.n), belief, rest
+        self.progress, self.at = progress, ("", 0.0)
         self.findings: list[RigFinding] = []
         self.wiring: Wiring | None = None
         self.identification: Identification | None = None
@@ -180,6 +181,11 @@ class _Wizard:
         room = np.array([c.high - c.low for c in belief.coordinates])
         self.enough = np.minimum([ENOUGH[u] for u in units], 0.2 * room)
         self.guard = np.minimum([MOST[u] for u in units], 0.6 * room)
+
+    def begin(self, what: str, part: float) -> None:
+        """Say what is done now, and what part of all is done before it."""
+        self.at = what, part
+        self.progress(what, part)
 
     def result(self) -> BringUp:
         """Return what was found."""
@@ -204,6 +210,7 @@ class _Wizard:
             moved = np.ptp(np.array(rows), axis=0)
             if not (moved > self.enough / 40).any():
                 break
+            self.progress(f"{self.at[0]}: it still moves", self.at[1])
         return np.asarray(moved)
 
     # -- listening ---------------------------------------------------------------------------
@@ -244,7 +251,9 @@ class _Wizard:
         for i, channel in enumerate(belief.inputs):
             most = SHARES[-1] * min(1.0, abs(inputs[i]) or 1.0)
             response = Response.none(belief.n)
-            for share in [s for s in SHARES if s <= most] or [most]:
+            shares = [s for s in SHARES if s <= most] or [most]
+            for k, share in enumerate(shares):
+                self.begin("small pushes", 0.1 + 0.15 * (i + k / len(shares)) / belief.m)
                 calm = self._wait_for_rest(rig)
                 push = doublets(share * channel.limit, [0.1], 0.15, self.rig.period)
                 try:
