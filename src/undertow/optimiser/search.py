@@ -60,14 +60,14 @@ RESTARTS, TRIED, TERMS = 11, 64, 24
 #: this part of the cost end a descent.
 LONG_PAUSE, SLOW = 40, 1e-4
 
-#: Confidence below which what searches with a model found is improved without one, too.
+#: Confidence from which what searches with a model found is hardly improved without one.
 AGREED = 0.5
 
 #: Widest spread of a first population along a ridge.
 FAR = 0.25
 
 #: Evaluations at most that improve a plan along its ridge: of a first answer, and where searches
-#: for an earlier arrival lead nowhere.
+#: for an earlier arrival lead nowhere; and what searches with a model found, without one.
 POLISH = 512
 
 #: A search for arrivals far and wide: its members, draws for each of them, and between which parts
@@ -235,7 +235,7 @@ def _go_on_from(task: Optimisation, one: Optimisation) -> bool:
     """Improve for all plausible plants each minimum that a search for one plant found.
 
     Where each leads to counts as often as the minimum was found.  A bound that some plants meet
-    misleads models: where they disagree, the best is improved without one.
+    misleads models: the best is improved without one, too, and for long where they disagree.
     """
     if task.centre.size > MODEL_SIZE:
         return _descend(task, task.centre, 0.03, task.left, 1e-4)
@@ -246,9 +246,9 @@ def _go_on_from(task: Optimisation, one: Optimisation) -> bool:
         converged &= search.converged
         if search.best_f < INADMISSIBLE:
             task.minima += times * [search.best_f]
-    if (confidence(task.minima) or 0.0) < AGREED:
-        return _descend(task, task.centre, 0.03, task.left, 1e-4)
-    return converged
+    agreed = (confidence(task.minima) or 0.0) >= AGREED
+    done = _descend(task, task.centre, 0.03, POLISH if agreed else task.left, 1e-4)
+    return done or (agreed and converged)
 
 
 def _draws(task: Optimisation, count: int) -> Iterator[tuple[FloatArray, FloatArray]]:
