@@ -110,3 +110,15 @@ def test_where_nothing_is_found_nothing_is_said() -> None:
     answer = optimiser.propose(rig.state(phi=ut.deg(80)), budget=ut.Budget(600))
     assert answer.status == "infeasible"
     assert answer.confidence is None
+
+
+@pytest.mark.slow
+def test_minima_of_single_surfaces_say_nothing_of_a_schedule() -> None:
+    """Not where they are those of one of many plants, either: its descent has one end."""
+    rig = ut.mechanisms.rotary_pendulum(d_e=0.025)
+    schedule = ut.DecisionVariables(reaching=True, schedule=0.5)
+    optimiser = ut.Cascade(rig, ut.MinimumEnergy(), freedom=schedule).optimiser
+    assert optimiser.loop.ensemble is not None
+    answer = optimiser.propose(rig.state(phi=ut.deg(30)), budget=ut.Budget(4096))
+    assert answer.plan is not None
+    assert answer.confidence is None

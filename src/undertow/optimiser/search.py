@@ -207,7 +207,7 @@ def _own_search(task: Optimisation) -> Iterator[bool]:
         _restart(task)
     yield converged
     if several:
-        task.kept = 0
+        task.kept, task.minima = 0, []  # minima of single surfaces
         task.switch_at(_division(task))
         yield _descend(task, task.centre, 0.1, task.left, 1e-4)
 
