@@ -157,11 +157,25 @@ def test_a_pushed_schedule_is_led_back(push: float) -> None:
 
 
 @pytest.mark.slow
-def test_two_inputs_that_switch_often_are_followed() -> None:
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_two_inputs_that_switch_often_are_followed(seed: int) -> None:
     """Six switchings in a fifth of a second; single surfaces take three times as long."""
-    made = cascade("two_motor_three_link")
+    made = cascade("two_motor_three_link", seed=seed)
     answers = made.optimiser.improve(made.mechanism.usual_start)
     assert any(answer.cost < 0.25 for answer in answers)
+
+
+def test_a_motion_with_a_part_of_the_inputs_keeps_to_it() -> None:
+    """It leaves the rest for what follows it, and arrives later."""
+    rig, whole = ut.mechanisms.rotary_pendulum(), earliest("rotary_pendulum")
+    arrival = EarliestArrival(rig, 0.01, *ut.MinimumTime().on(rig).range_of(rig), part=0.75)
+    guess = whole.with_inputs(0.75)
+    assert np.allclose(guess.x[:, : rig.n], whole.x[:, : rig.n])
+    assert np.allclose(guess.x[1:, rig.n :] * guess.time, whole.x[1:, rig.n :] * whole.time)
+    found = arrival.improve(guess)
+    assert found is not None
+    assert np.abs(found.u).max() <= 0.75 * rig.input_limits[0] * (1 + 1e-9)
+    assert whole.time < found.time < 1.5 * whole.time
 
 
 def test_a_surface_is_found_again_from_its_motion() -> None:

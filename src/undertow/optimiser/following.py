@@ -35,9 +35,9 @@ SHORTEST = 10
 FOLLOWS, ACCEPTED, CLOSE = 0.05, 0.5, 0.97
 
 #: The last piece is up to so many times as long as the others; when to look for its arrival, in
-#: parts of what is left of the motion, and how many of these while there may be shorter pieces.
-LAST, AFTER, BEFORE = 1.5, (1.0, 1.05, 1.1, 1.2, 1.3, 1.5, 2.0), 3
-
+#: parts of what is left of the motion, and how many of these while there may be shorter pieces; and
+#: how far off, in terminal radii, the first of these may end for another to be tried.
+LAST, AFTER, BEFORE, FAR = 1.5, (1.0, 1.05, 1.1, 1.2, 1.3, 1.5, 2.0), 2, 15.0
 
 #: Pieces of a motion at least, where the steps allow.
 PIECES = 6
@@ -146,8 +146,11 @@ class Follower:
                 x, given, end / part, time, measure, CLOSE * radius, before, target,
                 1 if divisible else MANY,
             )  # fmt: skip
-            if len(z) and np.linalg.norm(ends[0]) < radius:
+            miss = np.linalg.norm(ends[0]) if len(z) else np.inf
+            if miss < radius:
                 return z[0], time
+            if divisible and miss > FAR * radius:
+                break
         return None
 
     def _whole(

@@ -92,6 +92,12 @@ class OpenLoopMotion:
         x[1:, n:] /= SOONER
         return OpenLoopMotion(SOONER * self.time, x, self.u)
 
+    def with_inputs(self, part: float) -> OpenLoopMotion:
+        """Return the same path with a part of the inputs, slower, a guess."""
+        slower, x, n = 1.0 / math.sqrt(part), self.x.copy(), self.x.shape[1] // 2
+        x[1:, n:] /= slower
+        return OpenLoopMotion(slower * self.time, x, part * self.u)
+
     def mirrored(self) -> OpenLoopMotion:
         """Return it reflected in the straight line to its end, a guess: the other way round."""
         straight = np.linspace(self.x[0], np.zeros_like(self.x[0]), NODES + 1)
@@ -104,7 +110,8 @@ class EarliestArrival:
 
     ``mechanism``: the model, every input limited. ``radius``: ν of the terminal set. ``low``,
     ``high``: bounds of the states at the nodes, (2n,); infinite where there are none. ``late``:
-    whether there is no time left for another linear program.
+    whether there is no time left for another linear program. ``part``: of the input limits, that
+    the motion may take up.
     """
 
     mechanism: Mechanism
@@ -112,6 +119,12 @@ class EarliestArrival:
     low: FloatArray
     high: FloatArray
     late: Callable[[], bool] = lambda: False
+    part: float = 1.0
+
+    @property
+    def limits(self) -> FloatArray:
+        """Largest inputs of its motions, (m,)."""
+        return self.part * self.mechanism.input_limits
 
     def state_at(self, motion: OpenLoopMotion, t: float) -> FloatArray:
         """Return the state of a motion at a time before its end, s: (2n,)."""
@@ -136,7 +149,7 @@ class EarliestArrival:
         The latter are the accelerations with that input at zero.  A switch within a piece is
         where the limits before and after it make the piece's input in the mean.
         """
-        limits, piece = self.mechanism.input_limits, motion.time / NODES
+        limits, piece = self.limits, motion.time / NODES
         part = motion.u / limits
         states, inputs = [np.empty((2 * self.mechanism.n, 0))], [np.empty((len(limits), 0))]
         for k, i in zip(*np.nonzero(part[:-1] * part[1:] < 0), strict=True):
@@ -177,7 +190,7 @@ class EarliestArrival:
 
         What is found is a local optimum.
         """
-        limits, radius = self.mechanism.input_limits, INSIDE * self.radius
+        limits, radius = self.limits, INSIDE * self.radius
         x, u, T = (
             guess.x.T.copy(),
             np.clip(guess.u.T, -limits[:, None], limits[:, None]),
@@ -253,7 +266,7 @@ class EarliestArrival:
     ) -> _Program:
         """Linearise about nodes (2n, N + 1), inputs (m, N) and a time."""
         states, inputs = len(x), len(u)
-        limits, columns = self.mechanism.input_limits, states + inputs + 1
+        limits, columns = self.limits, states + inputs + 1
         moved, pushed = np.repeat(x[:, :-1], columns, axis=1), np.repeat(u, columns, axis=1)
         times = np.full(NODES * columns, T / NODES)
         for j in range(states):

@@ -31,9 +31,13 @@ WORTHWHILE = 1e-3
 #: Spread of draws far and wide.
 WIDE = 1.5
 
-#: A schedule as early as this many times the earliest arrival needs no other search; how often
-#: one is looked for that follows it.
-AS_EARLY, TRIES = 1.02, 3
+#: A schedule as early as this many times the earliest arrival needs no other search.
+AS_EARLY = 1.02
+
+#: The parts of the input limits that a motion may take up for a schedule to follow it, one try
+#: after another.  At its limits an input has nothing left to correct with: where it switches often,
+#: surfaces follow a motion that leaves it some.
+ROOM = (1.0, 0.9, 0.75)
 
 #: When a schedule in use is to arrive: in parts of its arrival where it is kept, else of what it
 #: promised; and whether the search begins from the designs.
@@ -94,17 +98,24 @@ def earliest_arrival(task: Optimisation, keep: int) -> EarliestArrival:
 
 
 def _follow(task: Optimisation, motion: OpenLoopMotion, keep: int) -> None:
-    """Look for a schedule that follows a motion, where that is earlier than the best plan.
+    """Look for a schedule that follows a motion, or one like it with smaller inputs.
 
-    So many evaluations are left over.
+    Where that is earlier than the best plan.  Each try has the same share of the evaluations, so
+    many of which are left over.
     """
-    if motion.time < (1.0 - WORTHWHILE) * task.best_cost - task.resolution:
-        for _ in range(TRIES):
-            plan = _schedule(task, earliest_arrival(task, keep), motion, keep)
-            if plan is not None:
-                task.consider(plan)
-                lead_back(task, plan)
-                break
+    for k, part in enumerate(ROOM):
+        later = (len(ROOM) - 1 - k) / (len(ROOM) - k)
+        kept = keep + int(later * max(0, task.left - keep))
+        arrival = replace(earliest_arrival(task, kept), part=part)
+        slower = motion if part == 1.0 else arrival.improve(motion.with_inputs(part))
+        earliest = (1.0 - WORTHWHILE) * task.best_cost - task.resolution
+        if slower is None or slower.time >= earliest:
+            continue
+        plan = _schedule(task, arrival, slower, kept)
+        if plan is not None:
+            task.consider(plan)
+            lead_back(task, plan)
+            break
 
 
 def lead_back(task: Optimisation, incumbent: Plan) -> bool:
