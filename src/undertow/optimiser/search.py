@@ -158,37 +158,44 @@ def _take_over(task: Optimisation, plainer: Optimisation | None) -> Iterator[boo
 
 
 def _own_search(task: Optimisation) -> Iterator[bool]:
-    """Improve the best of the designs, then look elsewhere; yields whether it has converged."""
+    """Search with the task's own decision variables; yields whether it has converged."""
+    return _earliest(task) if task.optimiser.counts_time else _least(task)
+
+
+def _earliest(task: Optimisation) -> Iterator[bool]:
+    """Improve the design that arrives first, then look elsewhere for an earlier arrival."""
+    task.cost(task.firsts[: max(1, task.left)])
+    done = _along_ridge(task, min(POLISH, task.left))
+    if not task.best_cost < INADMISSIBLE:
+        if task.plants == 1:
+            _descend_from_draws(task, ALONE, 3 * ALONE)
+        else:
+            _near_one_plant(task)
+        done = _along_ridge(task, min(POLISH, task.left))
+    yield done
+    schedule, done = task.optimiser.freedom.schedule > 0, False
+    if schedule:
+        for done in follow_earliest(task, task.left // 2):
+            yield done
+    if done:
+        return
+    _arrive_earlier(task, wide=True, keep=POLISH + schedule * (task.left // 2))
+    yield _along_ridge(task, POLISH if schedule else task.left)
+    if schedule:
+        yield from follow_earliest(task)
+
+
+def _least(task: Optimisation) -> Iterator[bool]:
+    """Improve the best of the designs by a smooth cost, then look elsewhere."""
     several = len(task.space.freedom.times) > 1 or task.optimiser.freedom.schedule > 0
-    several &= not task.optimiser.counts_time
     if several:
         task.switch_at((0.0,))
         task.kept = min(FINE * task.space.size, 3 * task.left // 4)
-    again = 0 if several or task.optimiser.counts_time else restart_budget(task.space.size)
+    again = 0 if several else restart_budget(task.space.size)
     if again and task.left >= single_budget(task.space.size) + again:
         task.kept = again
     z = task.firsts[: max(1, task.left)]
     scores = task.cost(z)
-    if task.optimiser.counts_time:
-        done = _along_ridge(task, min(POLISH, task.left))
-        if not task.best_cost < INADMISSIBLE:
-            if task.plants == 1:
-                _descend_from_draws(task, ALONE, 3 * ALONE)
-            else:
-                _near_one_plant(task)
-            done = _along_ridge(task, min(POLISH, task.left))
-        yield done
-        again, done = task.optimiser.freedom.schedule > 0, False
-        if again:
-            for done in follow_earliest(task, task.left // 2):
-                yield done
-        if done:
-            return
-        _arrive_earlier(task, wide=True, keep=POLISH + again * (task.left // 2))
-        yield _along_ridge(task, POLISH if again else task.left)
-        if again:
-            yield from follow_earliest(task)
-        return
     one = None
     if task.centre.size <= MODEL_SIZE:
         _model_search(task, task.centre)

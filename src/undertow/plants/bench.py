@@ -345,8 +345,11 @@ class Bench:
         return self.with_timing(input_delay=0.6 * delay, measurement_delay=0.4 * delay)
 
     def with_encoders(self, counts: Mapping[str, float]) -> Self:
-        """Return the bench with other encoders: one count of each that is named, rad or m."""
-        others = {name: Encoder(count) for name, count in counts.items()}
+        """Return the bench with other counts of its encoders: of each that is named, rad or m."""
+        others = {
+            name: replace(self.encoders.get(name, Encoder()), resolution=count, source="")
+            for name, count in counts.items()
+        }
         return replace(self, encoders={**self.encoders, **others})
 
 

@@ -169,11 +169,12 @@ class Recipe:
         for name, count in self.encoders.items():
             one_of("encoder of a run", name, [c.name for c in self.belief.coordinates])
             positive(f"one count of '{name}'", count, "2π/4096 is that of 4096 counts a turn")
-        told = {"delay": self.delay is not None, "encoders": bool(self.encoders)}
+        counts = ", ".join(f"{name}={count:g}" for name, count in self.encoders.items())
+        told = {"delay": "" if self.delay is None else f"{self.delay:g} s", "encoders": counts}
         for what in (name for name in told if told[name] and self.rig == "ideal"):
             raise InvalidInputError(
                 f"{what} of a run",
-                value=f"{getattr(self, what)}, on an ideal rig",
+                value=f"{told[what]}, on an ideal rig",
                 limit="a rig that has such: realistic, or your own driver",
                 remedy="Leave it out",
             )
