@@ -35,8 +35,8 @@ SHORTEST = 10
 FOLLOWS, ACCEPTED, CLOSE = 0.05, 0.5, 0.97
 
 #: The last piece is up to so many times as long as the others; when to look for its arrival, in
-#: parts of what is left of the motion, and how many of these while there may be shorter pieces; and
-#: how far off, in terminal radii, the first of these may end for another to be tried.
+#: parts of what is left of the motion, and how many of these while there may be shorter pieces: the
+#: first alone unless an end comes so near, in terminal radii.
 LAST, AFTER, BEFORE, FAR = 1.5, (1.0, 1.05, 1.1, 1.2, 1.3, 1.5, 2.0), 2, 15.0
 
 #: Pieces of a motion at least, where the steps allow.
@@ -138,7 +138,7 @@ class Follower:
         before: FloatArray | None,
     ) -> tuple[FloatArray, float] | None:
         """Return a surface, (d,), that leads from x to the target, and in what time, s."""
-        radius, target = self.arrival.radius, np.zeros_like(x)
+        radius, target, closest = self.arrival.radius, np.zeros_like(x), math.inf
         parts = AFTER[:BEFORE] if divisible else AFTER
         for part, measure in itertools.product(parts, (scale, np.full_like(x, radius))):
             time = self.step * math.ceil(part * rest / self.step)
@@ -146,10 +146,11 @@ class Follower:
                 x, given, end / part, time, measure, CLOSE * radius, before, target,
                 1 if divisible else MANY,
             )  # fmt: skip
-            miss = np.linalg.norm(ends[0]) if len(z) else np.inf
-            if miss < radius:
+            if len(z):
+                closest = min(closest, float(np.linalg.norm(ends[0])))
+            if closest < radius:
                 return z[0], time
-            if divisible and miss > FAR * radius:
+            if divisible and closest > FAR * radius:
                 break
         return None
 

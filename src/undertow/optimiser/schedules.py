@@ -108,9 +108,10 @@ def _follow(task: Optimisation, motion: OpenLoopMotion, keep: int) -> None:
         kept = keep + int(later * max(0, task.left - keep))
         arrival = replace(earliest_arrival(task, kept), part=part)
         slower = motion if part == 1.0 else arrival.improve(motion.with_inputs(part))
-        earliest = (1.0 - WORTHWHILE) * task.best_cost - task.resolution
-        if slower is None or slower.time >= earliest:
+        if slower is None:
             continue
+        if slower.time >= (1.0 - WORTHWHILE) * task.best_cost - task.resolution:
+            break
         plan = _schedule(task, arrival, slower, kept)
         if plan is not None:
             task.consider(plan)
