@@ -35,9 +35,12 @@ SHORTEST = 10
 FOLLOWS, ACCEPTED, CLOSE = 0.05, 0.5, 0.97
 
 #: The last piece is up to so many times as long as the others; when to look for its arrival, in
-#: parts of what is left of the motion, and how many of these while there may be shorter pieces: the
-#: first alone unless an end comes so near, in terminal radii.
-LAST, AFTER, BEFORE, FAR = 1.5, (1.0, 1.05, 1.1, 1.2, 1.3, 1.5, 2.0), 2, 15.0
+#: parts of what is left of the motion, and how many of these while there may be shorter pieces.
+LAST, AFTER, BEFORE = 1.5, (1.0, 1.05, 1.1, 1.2, 1.3, 1.5, 2.0), 2
+
+#: While there may be shorter pieces and none ends nearer than this, in terminal radii, no other
+#: arrival is looked for.
+FAR = 15.0
 
 #: Pieces of a motion at least, where the steps allow.
 PIECES = 6

@@ -88,15 +88,17 @@ class OpenLoopMotion:
 
     def faster(self) -> OpenLoopMotion:
         """Return the same path in less time, a guess: there may be an earlier arrival nearby."""
-        x, n = self.x.copy(), self.x.shape[1] // 2
-        x[1:, n:] /= SOONER
-        return OpenLoopMotion(SOONER * self.time, x, self.u)
+        return self._in(SOONER, self.u)
 
     def with_inputs(self, part: float) -> OpenLoopMotion:
         """Return the same path with a part of the inputs, slower, a guess."""
-        slower, x, n = 1.0 / math.sqrt(part), self.x.copy(), self.x.shape[1] // 2
-        x[1:, n:] /= slower
-        return OpenLoopMotion(slower * self.time, x, part * self.u)
+        return self._in(1.0 / math.sqrt(part), part * self.u)
+
+    def _in(self, times: float, u: FloatArray) -> OpenLoopMotion:
+        """Return the same path in so many times the time, with other inputs."""
+        x, n = self.x.copy(), self.x.shape[1] // 2
+        x[1:, n:] /= times
+        return OpenLoopMotion(times * self.time, x, u)
 
     def mirrored(self) -> OpenLoopMotion:
         """Return it reflected in the straight line to its end, a guess: the other way round."""

@@ -87,13 +87,16 @@ def earliest_motion(task: Optimisation, arrival: EarliestArrival) -> OpenLoopMot
     return arrival.improve(OpenLoopMotion.of(loop.simulate(task.x, best, duration=long), long))
 
 
-def earliest_arrival(task: Optimisation, keep: int) -> EarliestArrival:
-    """Return the task over all inputs, as long as more evaluations than these are left."""
+def earliest_arrival(task: Optimisation, keep: int, part: float = 1.0) -> EarliestArrival:
+    """Return the task over all inputs, as long as more evaluations than these are left.
+
+    ``part``: of the input limits, that it may take up.
+    """
     loop = task.loop
     low, high = loop.objective.range_of(loop.mechanism)
     radius = loop.objective.terminal_radius
     return EarliestArrival(
-        loop.mechanism, radius, low, high, lambda: task.left <= keep or task.late()
+        loop.mechanism, radius, low, high, lambda: task.left <= keep or task.late(), part
     )
 
 
@@ -104,15 +107,15 @@ def _follow(task: Optimisation, motion: OpenLoopMotion, keep: int) -> None:
     many of which are left over.
     """
     for k, part in enumerate(ROOM):
-        later = (len(ROOM) - 1 - k) / (len(ROOM) - k)
-        kept = keep + int(later * max(0, task.left - keep))
-        arrival = replace(earliest_arrival(task, kept), part=part)
-        slower = motion if part == 1.0 else arrival.improve(motion.with_inputs(part))
-        if slower is None:
+        tries = len(ROOM) - k
+        kept = keep + max(0, task.left - keep) * (tries - 1) // tries
+        arrival = earliest_arrival(task, kept, part)
+        followed = motion if part == 1.0 else arrival.improve(motion.with_inputs(part))
+        if followed is None:
             continue
-        if slower.time >= (1.0 - WORTHWHILE) * task.best_cost - task.resolution:
+        if followed.time >= (1.0 - WORTHWHILE) * task.best_cost - task.resolution:
             break
-        plan = _schedule(task, arrival, slower, kept)
+        plan = _schedule(task, arrival, followed, kept)
         if plan is not None:
             task.consider(plan)
             lead_back(task, plan)

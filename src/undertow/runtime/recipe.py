@@ -171,13 +171,14 @@ class Recipe:
             positive(f"one count of '{name}'", count, "2π/4096 is that of 4096 counts a turn")
         counts = ", ".join(f"{name}={count:g}" for name, count in self.encoders.items())
         told = {"delay": "" if self.delay is None else f"{self.delay:g} s", "encoders": counts}
-        for what in (name for name in told if told[name] and self.rig == "ideal"):
-            raise InvalidInputError(
-                f"{what} of a run",
-                value=f"{told[what]}, on an ideal rig",
-                limit="a rig that has such: realistic, or your own driver",
-                remedy="Leave it out",
-            )
+        for what, value in told.items():
+            if value and self.rig == "ideal":
+                raise InvalidInputError(
+                    f"{what} of a run",
+                    value=f"{value}, on an ideal rig",
+                    limit="a rig that has such: realistic, or your own driver",
+                    remedy="Leave it out",
+                )
         stall = self.settings.max_step_interval
         if not SHORTEST <= self.period < stall:
             raise InvalidInputError(
