@@ -38,7 +38,6 @@ TABLE = [
     (0.073, 40.0, 24.112, 23.849, 0.544),
     (0.0, 41.0, 7.352, 7.116, 0.509),
 ]
-DEFAULT = {(0.025, 41.0)}
 #: First intervals of the finer mesh.
 FINE = 160
 UPRIGHT = ut.state_box(phi=math.pi / 2)
@@ -249,6 +248,7 @@ def test_a_bound_is_the_same_in_any_unit_of_cost(price: float) -> None:
     assert found[1].stationarity < 1e-6
 
 
+@pytest.mark.slow
 def test_a_bound_is_the_same_in_any_unit_of_the_input() -> None:
     """In 2²⁰ N: unknowns are parts of the limits, and the search is the same."""
     plant, unit = linear_plant(2.0), 2.0**20
@@ -313,12 +313,10 @@ def test_double_integrator_takes_twice_the_root_of_distance_over_limit() -> None
 # -- against the checked numbers ----------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("d_e", "degrees", "energy_17", "energy_60", "duration"),
-    [
-        pytest.param(*row, marks=() if row[:2] in DEFAULT else pytest.mark.slow, id=str(row[:2]))
-        for row in TABLE
-    ],
+    [pytest.param(*row, id=str(row[:2])) for row in TABLE],
 )
 def test_rotary_pendulum_table(
     d_e: float, degrees: float, energy_17: float, energy_60: float, duration: float

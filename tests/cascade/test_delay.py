@@ -225,6 +225,7 @@ def test_a_derated_loop_moves_the_plant_with_weaker_motors(
         assert ends[0].x != pytest.approx(ends[2].x, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_plan_that_is_lost_later_stays_while_one_in_reserve_can_take_over(
     arm: ut.Mechanism,
 ) -> None:

@@ -65,6 +65,7 @@ def test_a_cascade_learns_the_plant(pendulum: ut.Mechanism) -> None:
     assert control.u == pytest.approx(asked.u)
 
 
+@pytest.mark.slow
 def test_a_cascade_whose_input_is_held_learns_so(
     pendulum: ut.Mechanism, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -431,6 +432,7 @@ def test_only_exact_states_leave_it_to_later_decisions(
     assert (after.plan == plan) == (not noise)
 
 
+@pytest.mark.slow
 def test_a_plan_that_is_late_on_a_plausible_plant_gives_way_to_one_close_by(
     pendulum: ut.Mechanism,
 ) -> None:
@@ -458,6 +460,7 @@ def test_a_plan_that_is_late_on_a_plausible_plant_gives_way_to_one_close_by(
     assert proposal.incumbent_cost > 1.2 * whole.cost[0]  # of the plan in reserve
 
 
+@pytest.mark.slow
 def test_what_is_best_for_the_estimate_is_in_use_while_it_can_be_mended(
     pendulum: ut.Mechanism,
 ) -> None:
@@ -481,6 +484,7 @@ def test_what_is_best_for_the_estimate_is_in_use_while_it_can_be_mended(
         assert motion.reached[0] == (not mendable)
 
 
+@pytest.mark.slow
 def test_on_a_bench_a_plan_that_can_wait_gives_way_to_none_that_costs_much_more(
     pendulum: ut.Mechanism,
 ) -> None:
@@ -510,6 +514,7 @@ def test_on_a_bench_a_plan_that_can_wait_gives_way_to_none_that_costs_much_more(
         assert after.predicted == pytest.approx(cost if waits else hurried.cost.min(), rel=0.01)
 
 
+@pytest.mark.slow
 def test_on_a_bench_a_plan_gives_way_only_to_what_predictions_can_tell_from_it(
     pendulum: ut.Mechanism,
 ) -> None:
@@ -549,6 +554,7 @@ def rubbing(pendulum: ut.Mechanism, friction: float) -> ut.Mechanism:
     return pendulum.disturbed({"theta": -friction * sp.tanh(theta_dot / 0.05)})
 
 
+@pytest.mark.slow
 def test_what_is_not_explained_asks_for_room(pendulum: ut.Mechanism) -> None:
     """Where friction stops what should have moved, a plan is to be home before the time is up."""
     objective, x = ut.MinimumEnergy(horizon=10.0), pendulum.state(theta=0.1)
@@ -578,6 +584,7 @@ def test_friction_that_nobody_tells_of_is_borne(reaching: bool) -> None:
         assert cascade.simulate(rig.state(phi=ut.deg(41)), plant=rubbing(plant, 0.02)).reached
 
 
+@pytest.mark.slow
 def test_a_first_plan_looks_ahead_to_the_next_decision(pendulum: ut.Mechanism) -> None:
     """It suits all plants and stays if nothing is decided; the next decision begins with more."""
     made = replace(scheduled(pendulum), freedom=ut.DecisionVariables())

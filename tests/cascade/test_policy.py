@@ -57,7 +57,8 @@ def test_a_plan_s_later_surfaces_take_over_and_episodes_are_told_apart() -> None
     assert act.predict(x[0])[0].shape == (1,)
 
 
-@pytest.mark.parametrize("belief", ["exact", pytest.param("usual", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("belief", ["exact", "usual"])
 def test_a_cascade_as_a_policy_decides_learns_and_balances(belief: Any) -> None:
     """Not dearer than its own simulation by more than what sampling costs; what it has learnt."""
     pytest.importorskip("gymnasium")

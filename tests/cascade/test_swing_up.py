@@ -154,6 +154,7 @@ def test_turns_are_taken_off_freely_turning_joints_alone() -> None:
     assert periods(stopped).tolist() == [0.0, 0.0]
 
 
+@pytest.mark.slow
 def test_from_hanging_to_balanced_and_again_after_a_knock(
     arm: ut.Mechanism, region: CatchRegion
 ) -> None:

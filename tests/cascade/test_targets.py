@@ -107,6 +107,7 @@ def test_a_jump_begins_a_new_task_for_lemma_3(run: ut.Run) -> None:
     assert np.nanmin(run.lemma3_slack) >= -1e-9
 
 
+@pytest.mark.slow
 def test_to_come_back_there_is_a_whole_horizon(swinging: ut.Cascade) -> None:
     """A load that swings in and out of the terminal set: each time it left, a task afresh."""
     watch = Watch(swinging.optimiser)
@@ -161,6 +162,7 @@ def test_what_takes_over_after_a_jump_keeps_within_the_travel_about_a_target_too
     assert slow == pytest.approx(fast, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_what_takes_over_after_a_jump_is_chosen_by_its_size() -> None:
     """A small push is not met as a large one is: the cart would spend its whole input on it."""
     cart = ut.mechanisms.cart_pendulum()
@@ -287,6 +289,7 @@ def test_the_gate_sees_the_reference_move(cascade: ut.Cascade) -> None:
     assert np.isfinite(admission.cost)
 
 
+@pytest.mark.slow
 def test_a_refusal_tells_what_the_plan_in_use_costs_along_the_reference(
     rig: ut.Mechanism, quick: ut.Surface
 ) -> None:

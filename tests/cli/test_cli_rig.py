@@ -206,6 +206,7 @@ class Arm(IdealRig):
 """
 
 
+@pytest.mark.slow
 @short_searches()
 def test_who_has_reversed_encoders_is_shown_the_way_to_the_bench(tmp_path: Path) -> None:
     """Lost at once, where the law is singular: the run knows the place, the bench the reason."""

@@ -979,6 +979,7 @@ def test_a_plant_that_is_another_mechanism_is_refused(rig: ut.Mechanism, other: 
             made()
 
 
+@pytest.mark.slow
 def test_a_motion_that_begins_outside_of_a_constraint_may_come_back_once() -> None:
     """It pays ∫ Φ(0, u_max) w/|w(0)| dt until it is inside; after that the constraint counts.
 

@@ -27,7 +27,7 @@ from undertow.mechanisms import LIBRARY
 from undertow.symbolic.formulas import plain, readable, tex
 
 #: A pendulum, three coordinates and two motors; the others are tried by the slow suite.
-QUICK = {"rotary_pendulum", "two_motor_three_link"}
+QUICK = {"rotary_pendulum", "gantry_crane"}
 NAMES = [
     name if name in QUICK else pytest.param(name, marks=pytest.mark.slow)
     for name in sorted(LIBRARY)

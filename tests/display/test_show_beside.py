@@ -232,6 +232,7 @@ def test_a_map_is_drawn_again_for_another_reaching_law() -> None:
     assert [asked.reaching for asked in maps.asked] == [ReachingLaw(), ReachingLaw(80.0, 0.4)]
 
 
+@pytest.mark.slow
 def test_a_map_about_a_target_keeps_within_the_travel() -> None:
     """What begins past the end of the rail, 95 % of 1.5 m, is lost wherever the target is."""
     cart = ut.mechanisms.cart_pendulum()

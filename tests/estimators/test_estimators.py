@@ -387,6 +387,7 @@ class _AlphaBeta(Estimator):
     noise_covariance = steady_covariance
 
 
+@pytest.mark.slow
 @short_searches()
 def test_an_estimator_of_ones_own_runs_on_a_rig_end_to_end(
     arm: ut.Mechanism, tmp_path: Path
@@ -423,6 +424,7 @@ def test_what_is_no_estimator_is_refused_at_the_door(arm: ut.Mechanism) -> None:
             Recipe(arm, start=(0, 0.1, 0, 0), estimator=lambda *_, made=made: made()).cascade  # noqa: B018
 
 
+@pytest.mark.slow
 @given(
     st.lists(st.floats(-1e300, 1e300), min_size=2, max_size=2),
     st.lists(st.floats(-1e300, 1e300), min_size=2, max_size=2),

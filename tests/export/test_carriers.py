@@ -144,9 +144,8 @@ def build_ros2(controller: EmbeddedController, folder: Path) -> Path:
     return source / "node"
 
 
-@pytest.mark.parametrize(
-    "name", ["rotary_pendulum", pytest.param("gantry_crane", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["rotary_pendulum", "gantry_crane"])
 def test_the_ros2_controller_is_the_python_law(name: str, tmp_path: Path) -> None:
     """The life of a controller; its commands are the twin's to 1e-9, and zero when it is ended.
 
@@ -258,6 +257,7 @@ def test_a_period_that_no_update_rate_has_is_refused() -> None:
     carriers(replace(controller, period=0.00069979006), ["ros2"])  # the remedy is one
 
 
+@pytest.mark.slow
 def test_the_command_writes_them_beside_the_c(tmp_path: Path) -> None:
     """One command for all; nothing is written where no folder is named, or for another word."""
     words = ["export", "c", "rotary_pendulum", "--start", "phi=5deg"]

@@ -126,7 +126,7 @@ def gcc(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     [
         pytest.param("rotary_pendulum", "double", DerivativeStep(), marks=pytest.mark.slow),
         ("rotary_pendulum", "float", SuperTwistingStep()),
-        (M, "double", SuperTwistingStep((300.0, 200.0, 100.0))),
+        pytest.param(M, "double", SuperTwistingStep((300.0, 200.0, 100.0)), marks=pytest.mark.slow),
         pytest.param(M, "float", DerivativeStep(0.004), marks=pytest.mark.slow),
         ("rotary_pendulum", "double", KalmanStep()),
     ],

@@ -219,6 +219,7 @@ def compare_with_mujoco(
         assert np.linalg.norm(ours - theirs) < 1e-8 * np.linalg.norm(theirs)
 
 
+@pytest.mark.slow
 def test_a_branched_urdf_moves_as_mujoco_says() -> None:
     """Claim: rotated inertias, fixed links with mass, branches, tilted axes and normalisation
     are read as MuJoCo reads them."""
@@ -716,7 +717,11 @@ def chain(count: int, axes: tuple[str, ...] = ("0 1 0",), tilt: str = "0 0 0") -
     ("text", "match"),
     [
         pytest.param(chain(12), "12 moving joints.*at most 8000", marks=pytest.mark.slow),
-        (chain(12, ("1 0 0", "0 1 0", "0 0 1"), "0.3 0.2 0.1"), "12 moving joints.*at most 8000"),
+        pytest.param(
+            chain(12, ("1 0 0", "0 1 0", "0 0 1"), "0.3 0.2 0.1"),
+            "12 moving joints.*at most 8000",
+            marks=pytest.mark.slow,
+        ),
         (chain(17), "moving joints of 'bad'.*got 17.*at most 16"),
         (robot('<link name="base"/>', *(link(f"l_{i}") for i in range(300)), *(
             joint(f"j_{i}", "base", f"l_{i}", "fixed") for i in range(300))), "links.*at most 200"),

@@ -146,6 +146,7 @@ def test_plans_of_a_search_do_what_they_promise(reaching: bool) -> None:
         assert motion.cost == pytest.approx(answer.cost, rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_better_basin_is_found() -> None:
     """From 40° three parameters arrive in 1.09 s; the search near the designs ends at 1.49 s."""
     rig = ut.mechanisms.rotary_pendulum(d_e=0.025)

@@ -43,6 +43,7 @@ def test_fewer_than_two_ends_tell_nothing(ends: list[float]) -> None:
     assert confidence(ends) is None
 
 
+@pytest.mark.slow
 def test_it_comes_true_on_landscapes_drawn_from_its_assumptions() -> None:
     """Minima of random number, size and cost: found as often as said, overall and where it is high.
 
@@ -80,6 +81,7 @@ def test_wide_best_basins_are_found_more_often_than_said() -> None:
     assert np.mean(true) > np.mean(np.array(said, dtype=float)) + 0.1
 
 
+@pytest.mark.slow
 def test_a_cold_search_says_it_and_a_warm_one_does_not() -> None:
     rig = ut.mechanisms.rotary_pendulum(d_e=0.025)
     optimiser = ut.Cascade(rig, ut.MinimumEnergy(), belief="exact").optimiser

@@ -25,6 +25,7 @@ FREE = DecisionVariables(rate=True)
 EFFORT = ut.objective_for(RIG, "effort")
 
 
+@pytest.mark.slow
 def test_near_the_target_a_free_rate_reaches_the_regulator_s_optimum() -> None:
     """xᵀPx of Riccati's equation, which no feedback goes below; three parameters stay above it."""
     crane = ut.mechanisms.overhead_crane()
@@ -100,10 +101,8 @@ def test_a_cascade_frees_rates_where_errors_cost_what_they_do_in_effort(
         assert one.optimiser.freedom.rate is rate
 
 
-@pytest.mark.parametrize(
-    ("name", "belief"),
-    [("overhead_crane", "exact"), pytest.param("acrobot", "usual", marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "belief"), [("overhead_crane", "exact"), ("acrobot", "usual")])
 def test_a_cascade_costs_what_the_best_of_all_inputs_does(name: str, belief: Any) -> None:
     """By the bound's collocation; with the given rate it is 14 % above, and more."""
     pytest.importorskip("casadi")

@@ -149,6 +149,7 @@ def test_three_seeds_agree_at_41_degrees(rig: ut.Mechanism, name: str, at_most: 
     assert np.ptp(costs) <= 0.01 * costs.min()
 
 
+@pytest.mark.slow
 def test_the_unit_of_a_cost_does_not_matter(rig: ut.Mechanism) -> None:
     """Costs from 1e8 on, ∫u² dt of kilonewtons, were taken for those of motions that fail."""
     x, found = rig.state(phi=0.3), []
@@ -514,6 +515,7 @@ def test_for_many_plants_far_and_wide_is_searched_on_one(
     assert 4 * quick.evaluations < wide.evaluations
 
 
+@pytest.mark.slow
 def test_the_first_of_many_plants_alone_is_an_ensemble_of_one(rig: ut.Mechanism) -> None:
     """With its own errors, whatever it weighs: it costs what a loop with it as the plant costs."""
     values = np.array([[p.value for p in rig.parameters]] * 3) * [[1.05], [1.0], [0.95]]

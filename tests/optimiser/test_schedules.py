@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import undertow as ut
+from support import rest_slow
 from undertow.base import InvalidInputError
 from undertow.bounds import bound
 from undertow.law import Plan, stability_margin
@@ -48,7 +49,7 @@ def test_surfaces_of_a_schedule_are_drawn_together_and_each_a_little_by_itself()
     assert together.std() == pytest.approx(0.5, rel=0.1)
 
 
-@pytest.mark.parametrize("most", [50, 1000])
+@pytest.mark.parametrize("most", rest_slow([50, 1000], 50))
 def test_a_schedule_for_least_time_keeps_to_its_budget(most: int) -> None:
     """But for what checks an answer; of 50 rollouts 320 were spent, of 1000 1243."""
     rig = ut.mechanisms.rotary_pendulum()

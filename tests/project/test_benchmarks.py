@@ -84,6 +84,7 @@ def test_every_benchmark_has_help_with_examples(script: str) -> None:
     assert "sys.argv[1:]" not in text
 
 
+@pytest.mark.slow
 def test_a_mechanism_that_is_none_is_refused_by_a_benchmark() -> None:
     refused = run(str(FOLDER / "regulator.py"), "tra")
     assert refused.returncode == 2
@@ -134,6 +135,7 @@ def test_the_regulator_solves_its_riccati_equation(rivals: ModuleType, rig: ut.M
     assert np.linalg.eigvals(lin.A - lin.input @ K).real.max() < 0
 
 
+@pytest.mark.slow
 def test_a_plan_of_least_time_arrives_when_it_says(rivals: ModuleType, rig: ut.Mechanism) -> None:
     x = rig.state(phi=ut.deg(10))
     mpc = rivals.ShootingMPC(rig, "time")

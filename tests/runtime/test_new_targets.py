@@ -74,6 +74,7 @@ def of_target(report: Report) -> list[tuple[float, str]]:
     return [(round(t, 3), text) for t, what, text in report.events if what == "target"]
 
 
+@pytest.mark.slow
 @short_searches()
 def test_a_run_is_given_another_target_and_replayed_to_the_same_bits(tmp_path: Path) -> None:
     """Asked for twice: the second takes the first's place before there is a plan for that."""

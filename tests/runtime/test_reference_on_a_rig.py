@@ -113,6 +113,7 @@ def test_against_the_clock_processes_share_the_reference(tmp_path: Path) -> None
         send_target(log, {"theta": 0.0})
 
 
+@pytest.mark.slow
 def test_the_slow_loop_predicts_along_the_reference() -> None:
     """On it the error stays zero to the next use, while the target moves on by degrees."""
     memory = first()

@@ -170,6 +170,7 @@ def test_from_hanging_to_balance_through_the_states_and_the_same_again(tmp_path:
     )
 
 
+@pytest.mark.slow
 @short_searches()
 def test_after_a_knock_a_plan_in_reserve_takes_over_and_a_decision_comes_early() -> None:
     """φ̇ jumps by 13 rad/s; what is not knocked over by it is up 1.2 s later."""

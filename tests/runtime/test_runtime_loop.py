@@ -293,6 +293,7 @@ def test_plans_are_made_within_the_travel_that_the_settings_leave(designed: bool
     assert again.cascade.objective == named.cascade.objective
 
 
+@pytest.mark.slow
 def test_each_coordinate_may_have_a_travel_of_its_own() -> None:
     """Through a log's words, too; one for each, or one for all; ranges apply besides."""
     cart = ut.mechanisms.cart_pendulum()

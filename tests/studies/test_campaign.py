@@ -18,6 +18,7 @@ import pytest
 from typer.testing import CliRunner
 
 import undertow as ut
+from support import rest_slow
 from undertow.base import (
     ArtefactError,
     InvalidInputError,
@@ -137,12 +138,7 @@ def test_states_on_the_surface_are_on_it() -> None:
 
 @pytest.mark.parametrize(
     "how",
-    [
-        {"threads": 2},
-        {"workers": 1},
-        pytest.param({"workers": 2}, marks=pytest.mark.slow),
-        pytest.param({"workers": 4}, marks=pytest.mark.slow),
-    ],
+    rest_slow([{"threads": 2}, {"workers": 1}, {"workers": 2}, {"workers": 4}], {"threads": 2}),
     ids=str,
 )
 def test_every_executor_writes_the_same_bits(
@@ -658,6 +654,7 @@ def test_every_state_of_a_proved_region_comes_home_without_a_limit() -> None:
         proved_set(other, REGIONS)
 
 
+@pytest.mark.slow
 def test_pictures_show_slices_volumes_and_proved_sets(serial: Path, tmp_path: Path) -> None:
     flat = picture(Campaign(MAP, serial))
     time, cost = flat.axes[:2]
@@ -682,6 +679,7 @@ def test_pictures_show_slices_volumes_and_proved_sets(serial: Path, tmp_path: Pa
         picture(Campaign(volume, serial))
 
 
+@pytest.mark.slow
 def test_a_terminal_set_is_drawn_where_states_are_off_the_surface(tmp_path: Path) -> None:
     """Its edge in the slice is |W x| = ρ, and what is said of its reach is that of the edge."""
     rig = ut.mechanisms.rotary_pendulum()
