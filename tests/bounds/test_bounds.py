@@ -327,6 +327,43 @@ def test_rotary_pendulum_table(
     assert least_time(d_e, degrees).cost == pytest.approx(duration, rel=1e-3, abs=5e-4)
 
 
+def hoisting_crane() -> ut.Mechanism:
+    """A trolley of 5 kg with a load of 3 kg on a rope of 1.5 m that is pulled in and let out."""
+    x, rope, swing = (
+        ut.Coordinate("x", "m"), ut.Coordinate("rope", "m"), ut.Coordinate("swing", "rad")
+    )  # fmt: skip
+    length, sine, cosine = 1.5 + rope.symbol, sp.sin(swing.symbol), sp.cos(swing.symbol)
+    right = x.velocity + rope.velocity * sine + length * cosine * swing.velocity
+    down = rope.velocity * cosine - length * sine * swing.velocity
+    return ut.Mechanism.from_energies(
+        "hoisting_crane",
+        [x, rope, swing],
+        [ut.Input("force", "N", 20.0), ut.Input("pull", "N", 60.0)],  # beyond the load's weight
+        kinetic=sp.Rational(5, 2) * x.velocity**2 + sp.Rational(3, 2) * (right**2 + down**2),
+        potential=3 * sp.Float(9.81) * (rope.symbol - length * cosine),
+        dissipation=x.velocity**2 / 2 + 2 * rope.velocity**2 + sp.Float(0.01) * swing.velocity**2,
+    )
+
+
+@pytest.mark.slow
+def test_a_motion_is_refined_where_it_is() -> None:
+    """Two inputs that switch often: solved on the first mesh, it was lost on every finer one."""
+    crane = hoisting_crane()
+    assert bound(crane, ut.MinimumTime(), x=-0.5, rope=0.3).cost < 1.32
+
+
+@pytest.mark.slow
+def test_a_guess_that_arrives_is_not_made_worse() -> None:
+    """Solved near it, whatever the built-in guesses find."""
+    crane = hoisting_crane()
+    schedule = ut.DecisionVariables(reaching=True, schedule=0.1)
+    run = ut.Cascade(crane, ut.MinimumTime(), belief="exact", freedom=schedule).simulate(
+        x=-0.5, rope=0.3
+    )
+    near = bound(crane, ut.MinimumTime(), x=-0.5, rope=0.3, guess=run.trajectory)
+    assert near.cost < run.cost
+
+
 @pytest.mark.slow
 def test_halving_the_mesh_does_not_move_the_cost() -> None:
     """First meshes of 80 and 160 intervals agree within 0.1 %, as ``change`` foretells."""

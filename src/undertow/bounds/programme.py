@@ -49,6 +49,11 @@ IDLE = 0.05
 #: states in rad and 1/s, the interior-point method loses its way to the acrobot's least time.
 PARTS = 10.0
 
+#: IPOPT's barrier where the guess is a motion of the mechanism already.  With its usual 0.1 the
+#: first iterations leave such a guess for the middle of all bounds, and end in another valley, or
+#: in none.
+BARRIER = 1e-4
+
 _IPOPT = {"print_level": 0, "sb": "yes", "tol": 1e-8}
 _STATUS: dict[str, Literal["optimal", "acceptable"]] = {
     "Solve_Succeeded": "optimal",
@@ -193,8 +198,11 @@ class Programme:
         *,
         fixed: float | None,
         patience: int = ITERATIONS,
+        moves: bool = False,
     ) -> Solution:
         """Solve on a mesh in [0, 1], at a fixed final time or a free one near the guess's.
+
+        ``moves``: the guess is a motion of the mechanism, and what is looked for is close by.
 
         Where rest costs something near is anywhere up to the horizon: shorter is always better.
         Where it costs nothing the cost is flat in a time that is too long, and the search for the
@@ -225,6 +233,8 @@ class Programme:
         first[0][0], first[2] = self.x0, np.clip(first[2], -limits, limits) / self.units
         scaling = 1.0 / self.unit if dynamics is self.cost else 1.0
         ipopt = {**_IPOPT, "max_iter": patience, "obj_scaling_factor": scaling}
+        if moves:
+            ipopt["mu_init"] = BARRIER
         programme = {"x": written.unknowns, "f": written.cost, "g": constraints}
         options = {"print_time": False, "show_eval_warnings": False, "ipopt": ipopt}
         solver = ca.nlpsol("bound", "ipopt", programme, options)
@@ -254,7 +264,7 @@ class Programme:
         )
         if dynamics is self.cost and report in _STATUS and 0 < cost < CHEAP * self.unit:
             self.unit = cost
-            again = self.solve(mesh, guess, dynamics, fixed=fixed, patience=patience)
+            again = self.solve(mesh, guess, dynamics, fixed=fixed, patience=patience, moves=moves)
             return replace(again, iterations=again.iterations + iterations)
         return Solution(
             name=guess.name,
@@ -328,7 +338,7 @@ class Programme:
             if shorter.status is not None:
                 tried = shorter
             if tried.status is not None:
-                tried = self.solve(mesh, tried.as_guess(), self.cost, fixed=None)
+                tried = self.solve(mesh, tried.as_guess(), self.cost, fixed=None, moves=True)
                 spent += tried.iterations
             if tried.status is not None:
                 break
@@ -360,7 +370,7 @@ class Programme:
             next_guess = tried.as_guess(pace=QUICKER * tried.time / time)
         if best.cost >= (1.0 - SETTLED) * held.cost:
             return replace(held, iterations=spent)
-        freed = self.solve(mesh, best.as_guess(), self.cost, fixed=None)
+        freed = self.solve(mesh, best.as_guess(), self.cost, fixed=None, moves=True)
         if freed.status is not None and freed.cost < best.cost:
             best = freed
         return replace(best, iterations=spent + freed.iterations)
@@ -370,7 +380,8 @@ class Programme:
         end = guess.x(np.array([0.0, guess.time]))[-1]
         if guess.time > self.longest or np.linalg.norm(end) > self.radius * (1 + 1e-6):
             return None
-        return self.solve(np.linspace(0.0, 1.0, count + 1), guess, self.cost, fixed=None)
+        mesh = np.linspace(0.0, 1.0, count + 1)
+        return self.solve(mesh, guess, self.cost, fixed=None, moves=True)
 
     def refine(self, solution: Solution) -> Solution:
         """Adapt and refine the mesh until cost and defects have settled."""
@@ -379,8 +390,8 @@ class Programme:
         for _ in range(REFINEMENTS):
             count = math.ceil(GROWTH * (len(solution.mesh) - 1))
             mesh = adapted_mesh(solution.mesh, errors, solution.u[::2], count)
-            guess = solution.as_guess()
-            finer = self.solve(mesh, guess, self.cost, fixed=self.longest if held else None)
+            fixed = self.longest if held else None
+            finer = self.solve(mesh, solution.as_guess(), self.cost, fixed=fixed, moves=True)
             spent += finer.iterations
             if finer.status is None:
                 return replace(finer, iterations=spent)
