@@ -5,7 +5,8 @@ then looks elsewhere: for a smooth cost by descents from the best of many draws,
 arrival by :mod:`undertow.optimiser.arrival`.  Of a smooth cost the best single surface comes first,
 where there may be several one after another: its copies are what they are improved from.  Where
 a plan has to suit many plausible plants, a smooth cost is searched far and wide for one of them, at
-a fraction of the time, and its minima are improved for all.
+a fraction of the time, and its minima are improved for all; where these then disagree, for all from
+the start.
 
 What independent random starts of a global search lead to is kept: it tells how likely its answer
 is the best one, see :mod:`undertow.optimiser.confidence`.  For a smooth cost these are descents of
@@ -202,16 +203,14 @@ def _least(task: Optimisation) -> Iterator[bool]:
         if not task.best_cost < INADMISSIBLE:
             one = _near_one_plant(task)
         yield False
-    one = one or _near_one_plant(task)
+    one, converged = one or _near_one_plant(task), False
     if one is not None and 0 < one.best_cost < INADMISSIBLE and task.best_cost < INADMISSIBLE:
-        if not several:
-            task.kept = 0
         converged = _go_on_from(task, one)
-    else:
+    if not converged:
         converged = _search_everywhere(task, z, scores)
-    if not several and task.kept:
-        task.kept = 0
-        _restart(task)
+        if not several and task.kept:
+            task.kept = 0
+            _restart(task)
     yield converged
     if several:
         task.kept, task.minima = 0, []  # minima of single surfaces
@@ -241,21 +240,23 @@ def _search_everywhere(task: Optimisation, z: FloatArray, scores: FloatArray) ->
 def _go_on_from(task: Optimisation, one: Optimisation) -> bool:
     """Improve for all plausible plants each minimum that a search for one plant found.
 
-    Where each leads to counts as often as the minimum was found.  A bound that some plants meet
-    misleads models: the best is improved without one, too, and for long where they disagree.
+    Returns whether most lead to the same, or there are too many coordinates to tell.  Where each
+    leads to counts as often as the minimum was found.  Where they disagree, as where what is best
+    for one plant is late on the others, what is best for all is somewhere else.
     """
     if task.centre.size > MODEL_SIZE:
-        return _descend(task, task.centre, 0.03, task.left, 1e-4)
+        _descend(task, task.centre, 0.03, task.left, 1e-4)
+        return True
     assert one.best is not None  # an admissible one
-    converged = True
     for found, times in one.found or [(one.best, 1)]:
         search = _model_search(task, task.space.encode(found))
-        converged &= search.converged
         if search.best_f < INADMISSIBLE:
             task.minima += times * [search.best_f]
-    agreed = (confidence(task.minima) or 0.0) >= AGREED
-    done = _descend(task, task.centre, 0.03, POLISH if agreed else task.left, 1e-4)
-    return done or (agreed and converged)
+    if (confidence(task.minima) or 0.0) < AGREED:
+        task.minima = []
+        return False
+    _descend(task, task.centre, 0.03, POLISH, 1e-4)
+    return True
 
 
 def _draws(task: Optimisation, count: int) -> Iterator[tuple[FloatArray, FloatArray]]:
