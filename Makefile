@@ -35,9 +35,9 @@ demo: $(STAMP) ## repeat the paper's experiment, tables and figures into results
 test: $(STAMP) ## run the tests, but for the slow ones
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-# With MINUTES=20, say, so much of them as fits: DRAW draws one of each file, then a second.
+# With MINUTES=20, say, so much of them as fits, their files in the order that DRAW draws.
 slow: $(STAMP) ## run the slow tests, or those that MINUTES leave time for
-	$(BIN)/python -m pytest -n $(WORKERS) --dist load --maxschedchunk 1 -m slow \
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m slow \
 	    $(if $(MINUTES),--minutes=$(MINUTES) --draw=$(DRAW)) || [ $$? -eq 5 ]
 
 # What is compiled runs in Python, too, a part of the time: tests/compiled_lines.py. Which test

@@ -7,7 +7,6 @@ import gc
 import os
 import random
 import time
-from collections import Counter
 from dataclasses import fields
 from typing import TYPE_CHECKING
 
@@ -39,21 +38,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group = parser.getgroup("undertow")
     count = "also run what is compiled in Python, where coverage sees its lines"
     group.addoption("--count-compiled", action="store_true", help=count)
-    group.addoption("--minutes", type=float, help="start no test later; they come in a drawn order")
+    group.addoption("--minutes", type=float, help="start no test later; its files in a drawn order")
     group.addoption("--draw", default="", help="a word that draws the order")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Draw the order where not all tests may have their turn: one of each file, then a second."""
+    """Put files in the drawn order where not all of them may have their turn."""
     if config.getoption("minutes") is not None:
-        draw = random.Random(config.getoption("draw"))
-        draw.shuffle(items)
-        turns = Counter[str]()
-        place = {}
-        for item in items:
-            place[item.nodeid] = turns[str(item.path)]
-            turns[str(item.path)] += 1
-        items.sort(key=lambda item: place[item.nodeid])
+        files = sorted({str(item.path) for item in items})
+        random.Random(config.getoption("draw")).shuffle(files)
+        place = {name: k for k, name in enumerate(files)}
+        items.sort(key=lambda item: place[str(item.path)])
 
 
 def pytest_collection_finish() -> None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 import undertow as ut
 from support import rest_slow
 from undertow.base import InfeasibleError, InvalidInputError
+from undertow.optimiser import search
 from undertow.optimiser.proposal import Proposal, motion_margins
 from undertow.optimiser.task import Optimisation
 from undertow.studies.paper import CASES
@@ -513,6 +514,39 @@ def test_for_many_plants_far_and_wide_is_searched_on_one(
     wide = optimiser.propose(start)
     assert quick.cost <= 1.001 * wide.cost
     assert 4 * quick.evaluations < wide.evaluations
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_where_one_plant_misleads_all_are_searched(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A link on a spring that its damping brings home, on one plant just in time: late on others.
+
+    Whoever trusts the minima for one plant pays a fifth more, and more.
+    """
+    motor, link = ut.Coordinate("motor", "rad"), ut.Coordinate("link", "rad")
+    parts = (
+        ut.Parameter("J_m", 0.01, "kg m^2", low=0),
+        ut.Parameter("J_l", 0.05, "kg m^2", low=0),
+        ut.Parameter("k", 5.0, "N m/rad", low=0),
+    )
+    J_m, J_l, k = (part.symbol for part in parts)
+    arm = ut.Mechanism.from_energies(
+        "elastic_joint", [motor, link], [ut.Input("torque", "N m", 2.0)],
+        kinetic=(J_m * motor.velocity**2 + J_l * link.velocity**2) / 2,
+        potential=k * (motor.symbol - link.symbol) ** 2 / 2,
+        dissipation=sp.Float(0.005) * motor.velocity**2 + sp.Float(0.002) * link.velocity**2,
+        parameters=parts,
+    )  # fmt: skip
+    x = arm.state(motor=ut.deg(45), link=ut.deg(45))
+    optimiser = ut.Cascade(arm, ut.MinimumEnergy(), seed=seed).optimiser
+    assert optimiser.loop.ensemble is not None
+    found = optimiser.propose(x)
+    monkeypatch.setattr(search, "AGREED", 0.0)
+    trusting = optimiser.propose(x)
+    assert trusting.evaluations < found.evaluations
+    assert found.cost < trusting.cost / 1.2
 
 
 @pytest.mark.slow

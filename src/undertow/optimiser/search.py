@@ -61,7 +61,8 @@ RESTARTS, TRIED, TERMS = 11, 64, 24
 #: this part of the cost end a descent.
 LONG_PAUSE, SLOW = 40, 1e-4
 
-#: Confidence from which what searches with a model found is hardly improved without one.
+#: Confidence from which minima for one plant lead to the best one for all, where it is hardly
+#: improved without a model.
 AGREED = 0.5
 
 #: Widest spread of a first population along a ridge.
@@ -203,10 +204,10 @@ def _least(task: Optimisation) -> Iterator[bool]:
         if not task.best_cost < INADMISSIBLE:
             one = _near_one_plant(task)
         yield False
-    one, converged = one or _near_one_plant(task), False
+    one, converged = one or _near_one_plant(task), None
     if one is not None and 0 < one.best_cost < INADMISSIBLE and task.best_cost < INADMISSIBLE:
         converged = _go_on_from(task, one)
-    if not converged:
+    if converged is None:
         converged = _search_everywhere(task, z, scores)
         if not several and task.kept:
             task.kept = 0
@@ -237,26 +238,27 @@ def _search_everywhere(task: Optimisation, z: FloatArray, scores: FloatArray) ->
     return converged
 
 
-def _go_on_from(task: Optimisation, one: Optimisation) -> bool:
+def _go_on_from(task: Optimisation, one: Optimisation) -> bool | None:
     """Improve for all plausible plants each minimum that a search for one plant found.
 
-    Returns whether most lead to the same, or there are too many coordinates to tell.  Where each
-    leads to counts as often as the minimum was found.  Where they disagree, as where what is best
-    for one plant is late on the others, what is best for all is somewhere else.
+    Returns whether that has converged, and ``None`` where most do not lead to the same: what is
+    best for one plant may be late on the others, and what is best for all somewhere else.  Where
+    each leads to counts as often as the minimum was found.  A bound that some plants meet misleads
+    models: the best is improved without one, too.
     """
     if task.centre.size > MODEL_SIZE:
-        _descend(task, task.centre, 0.03, task.left, 1e-4)
-        return True
+        return _descend(task, task.centre, 0.03, task.left, 1e-4)
     assert one.best is not None  # an admissible one
+    converged = True
     for found, times in one.found or [(one.best, 1)]:
         search = _model_search(task, task.space.encode(found))
+        converged &= search.converged
         if search.best_f < INADMISSIBLE:
             task.minima += times * [search.best_f]
     if (confidence(task.minima) or 0.0) < AGREED:
         task.minima = []
-        return False
-    _descend(task, task.centre, 0.03, POLISH, 1e-4)
-    return True
+        return None
+    return _descend(task, task.centre, 0.03, POLISH, 1e-4) or converged
 
 
 def _draws(task: Optimisation, count: int) -> Iterator[tuple[FloatArray, FloatArray]]:
