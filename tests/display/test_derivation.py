@@ -26,7 +26,7 @@ from undertow.law.sliding import singularity
 from undertow.mechanisms import LIBRARY
 from undertow.symbolic.formulas import plain, readable, tex
 
-#: A pendulum, three coordinates and two motors; the others are tried by the slow suite.
+#: A pendulum, four coordinates and two motors; the others are tried by the slow suite.
 QUICK = {"rotary_pendulum", "gantry_crane"}
 NAMES = [
     name if name in QUICK else pytest.param(name, marks=pytest.mark.slow)

@@ -204,7 +204,8 @@ def _least(task: Optimisation) -> Iterator[bool]:
         if not task.best_cost < INADMISSIBLE:
             one = _near_one_plant(task)
         yield False
-    one, converged = one or _near_one_plant(task), None
+    one = one or _near_one_plant(task)
+    converged = None
     if one is not None and 0 < one.best_cost < INADMISSIBLE and task.best_cost < INADMISSIBLE:
         converged = _go_on_from(task, one)
     if converged is None:
