@@ -10,6 +10,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 import sympy as sp
 
@@ -207,6 +208,41 @@ def test_other_functions_keep_their_place() -> None:
     """Those of a user's own files are numba's affair."""
     locators = (getattr(caching, "CacheImpl", None) or caching._CacheImpl)._locator_classes
     assert locators[0].from_function(ut.deg, "/somewhere/else.py") is None
+
+
+TOTAL = """from undertow.symbolic.compiler import compiled
+@compiled()
+def total(values):
+    result = 0.0
+    for value in values:
+        result += value
+    return result
+"""
+
+
+def test_two_that_compile_at_once_do_not_take_each_others_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Claim: where the index of one and the files of another were the last, nothing is mixed.
+
+    numba's own names are numbers, and both began with the first: code for arrays ran on pairs.
+    """
+
+    def first_use(folder: Path, values: object) -> float:
+        monkeypatch.setenv("UNDERTOW_CACHE", str(folder))
+        module = store.load_module("total", TOTAL)
+        del sys.modules[module.__name__]
+        return float(module.total(values))
+
+    arrays, pairs, mixed = (tmp_path / name for name in ("arrays", "pairs", "mixed"))
+    assert first_use(arrays, np.ones(3)) == 3
+    assert first_use(pairs, (1.0, 1.0)) == 2
+    shutil.copytree(pairs, mixed)
+    for path in arrays.rglob("*.nbc"):
+        shutil.copy2(path, mixed / path.relative_to(arrays))
+    assert len(list(mixed.rglob("*.nbc"))) == 2
+    assert first_use(mixed, (1.0, 1.0)) == 2
+    assert first_use(mixed, np.ones(3)) == 3
 
 
 READ_ONLY_RUN = (

@@ -24,7 +24,7 @@ import gc
 import hashlib
 import os
 import platform
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -143,11 +143,21 @@ def _loading(usual: Any) -> Any:
 
 
 def _saving(usual: Any) -> Any:
-    """Return how numba keeps what it compiles; a disk that refuses ours only costs time later."""
+    """Return how numba keeps what it compiles; a disk that refuses ours only costs time later.
+
+    numba numbers the files of a function in the order in which they come.  Two processes that
+    compile it at once for arguments of different types would both begin with the first, and an
+    index of the one could lead to the code of the other.  Ours are named by their types.
+    """
 
     def save_overload(cache: Any, signature: Any, data: Any) -> None:
-        ours = isinstance(cache._impl.locator, _PrivateLocator)
-        with suppress(OSError) if ours else nullcontext():
+        if not isinstance(cache._impl.locator, _PrivateLocator):
+            usual(cache, signature, data)
+            return
+        types = hashlib.sha256(repr(cache._index_key(signature, data.codegen)).encode())
+        name = f"{cache._impl.filename_base}.{types.hexdigest()[:16]}"
+        cache._cache_file._data_name_pattern = name + ".{number:d}.nbc"
+        with suppress(OSError):
             usual(cache, signature, data)
 
     return save_overload
