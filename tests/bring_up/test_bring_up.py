@@ -523,7 +523,7 @@ class Clings(Gaps):
         pytest.param("Gaps", "Wrong: input sign of voltage", marks=pytest.mark.slow),
         ("Lost", "error: reading of coordinate 1 of the rig: got no number"),
         ("Dies", "error: write() of the rig: got RuntimeError: bus error, "),
-        ("Clings", "Wrong: input sign of voltage"),
+        pytest.param("Clings", "Wrong: input sign of voltage", marks=pytest.mark.slow),
     ],
 )
 def test_the_wizard_meets_a_driver_that_fails(

@@ -9,6 +9,7 @@ import sympy as sp
 from matplotlib.figure import Figure
 
 import undertow as ut
+from support import rest_slow
 from undertow.base import InvalidInputError
 from undertow.closed_loop import figures
 
@@ -53,7 +54,7 @@ def test_labels_of_the_panels_are_in_line(motion: ut.Trajectory) -> None:
     assert np.ptp(ends) < 1  # pixel
 
 
-@pytest.mark.parametrize("kind", ["png", "pdf"])
+@pytest.mark.parametrize("kind", rest_slow(["png", "pdf"], "png"))
 def test_same_motion_same_picture_bit_for_bit(motion: ut.Trajectory, kind: str) -> None:
     """Drawing is deterministic: no date, no random identifier."""
     pictures = [

@@ -77,7 +77,7 @@ STRICT = (
 M = "two_motor_three_link"
 
 #: Mechanisms whose offers are tried by default: one of each shape.
-QUICK = {("rotary_pendulum", "float"), (M, "double"), ("gantry_crane", "double")}
+QUICK = {("rotary_pendulum", "float"), (M, "double")}
 
 
 #: What is written of a controller depends on it alone: tests of the same one share it.
@@ -125,7 +125,7 @@ def gcc(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     ("name", "real", "differentiator"),
     [
         pytest.param("rotary_pendulum", "double", DerivativeStep(), marks=pytest.mark.slow),
-        ("rotary_pendulum", "float", SuperTwistingStep()),
+        pytest.param("rotary_pendulum", "float", SuperTwistingStep(), marks=pytest.mark.slow),
         pytest.param(M, "double", SuperTwistingStep((300.0, 200.0, 100.0)), marks=pytest.mark.slow),
         pytest.param(M, "float", DerivativeStep(0.004), marks=pytest.mark.slow),
         ("rotary_pendulum", "double", KalmanStep()),
@@ -510,7 +510,7 @@ def fuzzed(controller: EmbeddedController, folder: Path, steps: int) -> list[int
 @pytest.mark.parametrize(
     ("name", "real", "step", "steps"),
     [
-        ("rotary_pendulum", "double", DerivativeStep(), 20_000),
+        pytest.param("rotary_pendulum", "double", DerivativeStep(), 20_000, marks=pytest.mark.slow),
         pytest.param(M, "float", DerivativeStep(), 60_000, marks=pytest.mark.slow),
         ("rotary_pendulum", "float", KalmanStep(), 20_000),
         *(
@@ -1024,7 +1024,9 @@ int main(void)
 """
 
 
-@pytest.mark.parametrize(("handler", "main"), [("fast", "slow"), ("slow", "fast")])
+@pytest.mark.parametrize(
+    ("handler", "main"), rest_slow([("fast", "slow"), ("slow", "fast")], ("slow", "fast"))
+)
 def test_plans_are_exchanged_whole_under_interruption(
     handler: str, main: str, tmp_path: Path
 ) -> None:

@@ -319,6 +319,7 @@ def test_a_surface_is_tuned_while_it_runs(place: Path) -> None:
         assert "not inside (0, inf)" in law.said[-1]
 
 
+@pytest.mark.slow
 def test_single_precision_another_prefix_and_a_name_of_our_own_files(tmp_path: Path) -> None:
     mechanism = replace(exported().mechanism, name="model")
     controller = EmbeddedController(

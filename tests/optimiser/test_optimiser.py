@@ -494,13 +494,9 @@ def test_what_suits_every_plant_is_found_near_what_is_best_for_one() -> None:
     assert cascade.loop.batch(start, first.plan).reached[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "name",
-    [
-        "rotary_pendulum",
-        pytest.param("double_pendulum_on_a_cart", marks=pytest.mark.slow),
-        pytest.param("reaction_wheel_pendulum", marks=pytest.mark.slow),
-    ],
+    "name", ["rotary_pendulum", "double_pendulum_on_a_cart", "reaction_wheel_pendulum"]
 )
 def test_for_many_plants_far_and_wide_is_searched_on_one(
     name: str, monkeypatch: pytest.MonkeyPatch

@@ -166,6 +166,7 @@ def test_two_inputs_that_switch_often_are_followed(seed: int) -> None:
     assert any(answer.cost < 0.25 for answer in answers)
 
 
+@pytest.mark.slow
 def test_a_motion_with_a_part_of_the_inputs_keeps_to_it() -> None:
     """It leaves the rest for what follows it, and arrives later."""
     rig, whole = ut.mechanisms.rotary_pendulum(), earliest("rotary_pendulum")

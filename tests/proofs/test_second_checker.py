@@ -145,21 +145,25 @@ def test_the_kept_file_is_decided_alike(program: Path, tmp_path: Path) -> None:
 @needs_compiler
 def test_verify_asks_both(program: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(second, "BUILT", program)
-    shown = CliRunner().invoke(app, ["verify", str(KEPT), "--both"])
+    kept = json.loads(KEPT.read_bytes())
+    claims = kept["subjects"][0]["claims"]
+    kept["subjects"][0]["claims"] = [claims[0], claims[-1]]
+    (few := tmp_path / "few.json").write_bytes(signed(kept))
+    shown = CliRunner().invoke(app, ["verify", str(few), "--both"])
     assert shown.exit_code == 0, shown.output
-    assert len(re.findall(r"proved, [\d.]+ s +proved, [\d.]+ s +agree", shown.output)) == 5
+    assert len(re.findall(r"proved, [\d.]+ s +proved, [\d.]+ s +agree", shown.output)) == 2
     liar = tmp_path / "liar"
-    lines = "\\n".join(f"claim {i}: undecided, 0.1 s" for i in range(1, 6))
+    lines = "\\n".join(f"claim {i}: undecided, 0.1 s" for i in range(1, 3))
     liar.write_text(f"#!/bin/sh\nprintf '{lines}\\n'\nexit 1\n")
     liar.chmod(0o755)
     monkeypatch.setattr(second, "BUILT", liar)
-    shown = CliRunner().invoke(app, ["verify", str(KEPT), "--both"])
+    shown = CliRunner().invoke(app, ["verify", str(few), "--both"])
     assert shown.exit_code == 1
-    assert shown.output.count("proved by one alone") == 5
+    assert shown.output.count("proved by one alone") == 2
     liar.write_text(liar.read_text().replace("undecided", "refuted"))
-    shown = CliRunner().invoke(app, ["verify", str(KEPT), "--both"])
+    shown = CliRunner().invoke(app, ["verify", str(few), "--both"])
     assert shown.exit_code == 1
-    assert shown.output.count("DISAGREE") == 5
+    assert shown.output.count("DISAGREE") == 2
 
 
 def test_what_is_not_built_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

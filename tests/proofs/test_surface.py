@@ -92,7 +92,6 @@ def test_floats_count_as_the_binary_numbers_that_they_are() -> None:
             for kind in (False, True)
         ],
         (2, 1, False),
-        (4, 2, False),
         (3, 2, True),
     ),
 )

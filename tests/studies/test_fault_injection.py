@@ -204,13 +204,17 @@ def test_no_fault_is_unsafe_while_it_swings_up(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "ending", "code"),
-    [
-        ("takes 1.5 ms for each read", "stopped", 5),
-        ("fails in every second write", "stopped", 5),
+    rest_slow(
+        [
+            ("takes 1.5 ms for each read", "stopped", 5),
+            ("fails in every second write", "stopped", 5),
+            ("fails to write for good", "stopped", 7),
+            ("is knocked over", "lost", 4),
+            ("hangs for 25 ms", "balanced", 0),
+        ],
         ("fails to write for good", "stopped", 7),
         ("is knocked over", "lost", 4),
-        ("hangs for 25 ms", "balanced", 0),
-    ],
+    ),
 )
 def test_a_rig_that_fails_gives_the_verdict_and_exit_code_it_should(
     name: str, ending: str, code: int, tmp_path: Path

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from support import rest_slow
 from undertow.base import ArtefactError, InvalidInputError, ResourceError
 from undertow.mechanisms import rotary_pendulum
 from undertow.models import FloatArray
@@ -115,7 +116,10 @@ def test_after_any_call_that_fails_at_every_step_the_output_is_off_or_not_said_t
     assert failed(campaign.drill(faults)) == []
 
 
-@pytest.mark.parametrize("text", ["fork:1:always:kept", "thread:1:once:ideal", "open:3:once:kept"])
+LACKING = ["thread:1:once:ideal", "open:3:once:kept"]
+
+
+@pytest.mark.parametrize("text", rest_slow(["fork:1:always:kept", *LACKING], *LACKING))
 def test_a_session_that_lacks_something_is_refused_before_the_rig_is_touched(
     campaign: Systematic, text: str
 ) -> None:
@@ -458,7 +462,7 @@ MOMENTS = ["first", "warming up", "ready", "between", "read", "close", "log", "w
 
 @pytest.mark.parametrize(
     "moment",
-    [pytest.param(m, marks=() if m in ("ready", "read") else pytest.mark.slow) for m in MOMENTS],
+    [pytest.param(m, marks=() if m == "ready" else pytest.mark.slow) for m in MOMENTS],
 )
 def test_two_signals_at_any_moment_of_a_session_end_safely(
     campaign: Systematic, tmp_path: Path, moment: str

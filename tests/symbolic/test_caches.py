@@ -193,6 +193,7 @@ def run(code: str, lock: bool = False, **environment: str) -> list[str]:
     return done.stdout.splitlines()
 
 
+@pytest.mark.slow
 def test_numba_keeps_our_functions_where_nobody_else_can_write(tmp_path: Path) -> None:
     """Not where the environment says, if others can write there: what it keeps are pickles."""
     anybody = tmp_path / "anybody"
