@@ -100,7 +100,8 @@ def certify(
         The paper's five cases instead.
     seconds
         Time to search for each region on the surface, s, by default 60, or 0 with --appendix; 0
-        leaves regions out. The proof of what is found comes on top.
+        leaves regions out. A step that has begun is finished, and the proof of what is found comes
+        on top: with three coordinates minutes.
     loop
         Also prove from how far off the target the closed loop converges: along a line up to the
         start where that names one state, else in a box of all that it names, each with both signs;

@@ -129,8 +129,9 @@ def prove_region(
     motion, direction, seed
         As for :func:`search_region`.
     seconds
-        Process time of the search at most.  The proofs are not timed: with ``seconds`` left out
-        the work does not depend on the machine.
+        Process time after which no step of the search begins; one takes seconds with three
+        coordinates.  The proofs are not timed: with ``seconds`` left out the work does not depend
+        on the machine.
 
     Returns
     -------
