@@ -1,8 +1,8 @@
 """Least squares of a recorded motion: which quantities are free, and ways to the least.
 
-Which parameters are free is decided first: one whose column of the Jacobian is nearly a
-combination of those already chosen is held (subset selection; Brun, Reichert, Künsch, *Water
-Resources Research* 37(4), 2001).
+Which parameters are free is decided first: one whose column of the Jacobian is a combination of
+those already chosen is held (subset selection; Brun, Reichert, Künsch, *Water Resources Research*
+37(4), 2001).  One whose column is nearly that is held in the end, unless the fit needs it.
 
 What a reading is worth: an encoder's error is the same for as long as nothing moves by a count,
 unless noise stirs it: a hundred readings at rest are one reading.  Least squares that take them
@@ -97,6 +97,21 @@ def correlated(J: FloatArray, r: FloatArray, n: int) -> FloatArray:
     return np.asarray(np.diag(freedom * inverse @ S @ inverse))
 
 
+def clustered(J: FloatArray, r: FloatArray, n: int) -> FloatArray:
+    """Return variances that residuals correlated within each of ``PARTS`` of a motion make, (p,).
+
+    The diagonal of (JᵀJ)⁻¹ S (JᵀJ)⁻¹, S the sum of g gᵀ with g the sum of all scores in a part
+    (Liang and Zeger, *Biometrika* 73(1), 1986); rows coordinate by coordinate. What the model
+    leaves out, say a friction of another form, makes residuals far below a count that are alike for
+    a whole push: from sample to sample they do not show.
+    """
+    inverse = np.linalg.pinv(J.T @ J)
+    scores = sum(np.split(J * r[:, None], n))
+    sums = np.array([part.sum(axis=0) for part in np.array_split(scores, PARTS)])
+    spread = sums.T @ sums * PARTS / (PARTS - 1)
+    return np.asarray(np.diag(inverse @ spread @ inverse))
+
+
 def counted(
     predicted: FloatArray, noise: FloatArray, sigma: FloatArray, variance: FloatArray, J: FloatArray
 ) -> FloatArray:
@@ -118,6 +133,9 @@ def counted(
         draws.append(solve @ (error / np.sqrt(variance)).T.ravel())
     return np.asarray(np.var(draws, axis=0, ddof=1))
 
+
+#: Parts of a motion that :func:`clustered` takes for independent.
+PARTS = 16
 
 #: Names of what a record begins with: fitted, not reported.
 START, RATE = "_start", "_rate"
@@ -193,8 +211,13 @@ def candidates(mechanism: Mechanism, coulomb: float, record: MotionRecord) -> li
     return [*begins, *variables, *named[0], *dampers, *gains, *named[1], *named[2]]
 
 
-#: Sine of the angle to the chosen columns below which a parameter is held.
-INDEPENDENT = 0.15
+#: Sine of the angle to the chosen columns below which a parameter is held, and below which it is
+#: held in the end unless the fit needs it.
+INDEPENDENT, DOUBTFUL = 0.05, 0.15
+
+#: The fit needs a parameter where holding it makes the sum of squares larger by this part.  One
+#: that is in proportion to others does not change it, however exact the motion is.
+NEEDED = 0.1
 
 #: Stages of a fit: length of the pieces in which the motion is fitted, s; part of it that is;
 #: whether breaking away is fitted, which is sharp and can wait until the rest is nearly right.
@@ -253,6 +276,19 @@ class Fit:
         passive = float(np.abs(mechanism.forces(0.0, x0 + 0.1, np.zeros(mechanism.n))).max())
         self.candidates = candidates(mechanism, 0.01 * max(passive, 1e-3), record)
 
+    def without(self, v: Quantity, free: list[Quantity], z: FloatArray) -> dict[str, float]:
+        """Values of the others, to first order, where a free quantity is held at the model's."""
+        fewer = [other for other in free if other is not v]
+        kept = np.array([a for a, other in zip(z, free, strict=True) if other is not v])
+        change = v.nominal / v.scale - float(z[free.index(v)])
+        return _values(fewer, kept + change * self.shifts(fewer, kept, [v])[:, 0])
+
+    def shifts(self, free: list[Quantity], z: FloatArray, held: list[Quantity]) -> FloatArray:
+        """Change of the scaled variables by all of a held one more, to first order, (p, h)."""
+        start = self._start(held, {v.name: v.nominal for v in held})
+        J = self.jacobian([*free, *held], np.concatenate([z, start]))
+        return np.asarray(-np.linalg.pinv(J[:, : len(free)]) @ J[:, len(free) :])
+
     def look_at(self, piece: float, part: float) -> None:
         """Fit the first part of the motion from here on, in pieces so long, s.
 
@@ -307,12 +343,13 @@ class Fit:
         away = self.moved - self._simulate(_values(free, z))
         return np.asarray(away - away.mean(axis=0))
 
+    @np.errstate(over="ignore", invalid="ignore")  # a guess that runs away is only far off
     def residual(self, free: list[Quantity], z: FloatArray) -> FloatArray:
         """The same, each in its standard deviation, one coordinate after the other."""
         away = self.difference(free, z)
         weights = np.broadcast_to(1.0 / self.variance, away.shape)
         away -= (weights * away).sum(axis=0) / weights.sum(axis=0)
-        away = np.nan_to_num(away * np.sqrt(weights), nan=0.0, posinf=1e6, neginf=-1e6)
+        away = np.nan_to_num(away * np.sqrt(weights), nan=1e6, posinf=1e6, neginf=-1e6)
         return np.asarray(np.clip(away, -1e6, 1e6).T.ravel())
 
     def jacobian(
@@ -400,6 +437,14 @@ class Fit:
                 break
         assert best is not None  # there are ways
         cost, free, z = best
+        sure = self.choose(_values(free, z), [], (), DOUBTFUL)
+        for v in reversed([v for v in free if v not in sure and math.isfinite(v.nominal)]):
+            fewer = [other for other in free if other is not v]
+            start = self.without(v, free, z)
+            without = self.solve(fewer, start, 1e-5)
+            higher = float((self.residual(fewer, without) ** 2).sum())
+            if higher < (1 + NEEDED) * cost:
+                cost, free, z = higher, fewer, without
         progress("beginning again beside it", 1 - 0.5 / len(ROUTES))
         for v in free:
             values = _values(free, z)
@@ -427,7 +472,11 @@ class Fit:
         return free, z
 
     def choose(
-        self, values: Mapping[str, float], first: list[Quantity], without: tuple[str, ...]
+        self,
+        values: Mapping[str, float],
+        first: list[Quantity],
+        without: tuple[str, ...],
+        independent: float = INDEPENDENT,
     ) -> list[Quantity]:
         """Return the free variables: each tells something that those before it do not."""
         held = (*without, "_", "delay") if self.pieces else without
@@ -441,7 +490,7 @@ class Fit:
             rest = column - basis @ (basis.T @ column)
             rest -= basis @ (basis.T @ rest)
             # A change by its whole size must be seen against one count in every sample.
-            if length > math.sqrt(len(J)) / 3 and np.linalg.norm(rest) > INDEPENDENT * length:
+            if length > math.sqrt(len(J)) / 3 and np.linalg.norm(rest) > independent * length:
                 free.append(v)
                 basis = np.column_stack([basis, rest / np.linalg.norm(rest)])
         return free

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.stats
 
 from undertow.base import Progress, no_progress
-from undertow.bring_up.fit import Fit, correlated, counted
+from undertow.bring_up.fit import Fit, clustered, correlated, counted
 from undertow.bring_up.motion import MotionRecord
 from undertow.models import FloatArray, Mechanism
 
@@ -46,6 +46,9 @@ class Identification:
     """What a motion says of its mechanism.
 
     ``held``: parameters kept at their nominal values: the motion does not tell them apart.
+    ``elasticities``: by parameter that is held, but gravity, and by quantity whose estimate is at
+    least three times its uncertainty: by how many per cent that estimate would be larger if the
+    former were held at 1 % more.
     ``residual``: RMS of measured less predicted, (n,), rad or m; ``before``: the same with the
     nominal model. ``explained``: share of the motion that is explained, (n,), 1 for all of it.
     ``predicted``: what the identified model says of the motion, (N, n), about the same zero as
@@ -54,6 +57,7 @@ class Identification:
 
     estimates: Mapping[str, Estimate]
     held: tuple[str, ...]
+    elasticities: Mapping[str, Mapping[str, float]]
     residual: FloatArray
     before: FloatArray
     explained: FloatArray
@@ -74,9 +78,12 @@ def identify(
     Identification
         Estimates by least squares in which every reading counts for what it is worth
         (:func:`undertow.bring_up.fit.readings`), with 95 % confidence intervals from the
-        Jacobian, corrected for residuals that are correlated in time (Newey and West,
-        *Econometrica* 55(3), 1987), and no narrower than what the counting of the encoders
-        alone would make them.  What leaves no trace in the record is held at the model's value.
+        Jacobian, corrected for residuals that are correlated from sample to sample (Newey and
+        West, *Econometrica* 55(3), 1987) and within a part of the motion, and no narrower than
+        what the counting of the encoders alone would make them.  They are for a rig that the
+        model describes, and for what is held at the model's value: what leaves no trace in the
+        record, or none that other quantities could not have left; see
+        :attr:`Identification.elasticities`.
 
     Raises
     ------
@@ -88,8 +95,13 @@ def identify(
     z = fit.weigh(free, z)
     J, r = fit.jacobian(free, z), fit.residual(free, z)
     predicted = fit.moved - fit.difference(free, z)
-    variances = np.maximum(
-        correlated(J, r, mechanism.n), counted(predicted, fit.noise, fit.sigma, fit.variance, J)
+    variances = np.max(
+        [
+            correlated(J, r, mechanism.n),
+            clustered(J, r, mechanism.n),
+            counted(predicted, fit.noise, fit.sigma, fit.variance, J),
+        ],
+        axis=0,
     )
     quantile = float(scipy.stats.norm.ppf(0.975))
     estimates = {}
@@ -113,9 +125,20 @@ def identify(
     known = {p.name for p in mechanism.parameters}
     changed = {k: e.value for k, e in estimates.items() if k in known}
     held = tuple(p.name for p in mechanism.parameters if p.name not in changed)
+    offered = [v for v in fit.candidates if v.name in held]
+    changes = fit.shifts(free, z, offered)
+    elasticities = {
+        v.name: {
+            one.name: float(change * quantity.scale / one.value)
+            for quantity, change in zip(free, column, strict=True)
+            if (one := estimates.get(quantity.name)) and one.value > 3 * (one.high - one.value)
+        }
+        for v, column in zip(offered, changes.T, strict=True)
+    }
     return Identification(
         estimates,
         held,
+        elasticities,
         fit.difference(free, z).std(axis=0),
         fit.difference([], np.zeros(0)).std(axis=0),
         fit.explained(free, z),

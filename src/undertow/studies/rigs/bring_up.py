@@ -27,6 +27,9 @@ from undertow.studies.ledger import Key
 #: errors of the counts are nearly independent; without, they hang together for many samples.
 NOISES = (1e-3, 0.0)
 
+#: Quantities that are named of those that a held parameter changes.
+SHOWN = 6
+
 #: (estimate − truth)/(standard error), by quantity.
 Deviations = dict[str, float]
 
@@ -37,15 +40,17 @@ PUSH, WIDTHS, PAUSE = 2.5, (0.05, 0.1, 0.2, 0.1, 0.05, 0.2, 0.15), 0.3
 def rig_in_the_class(
     seed: int, noise: float = NOISES[0]
 ) -> tuple[Mechanism, RealisticRig, dict[str, float]]:
-    """Return a belief, a rig that the wizard's model class contains, and what is true of it.
+    """Return a belief, a rig that the wizard's model class contains, and what there is to find.
 
-    Counted and noisy positions, dry friction, a delay, and parameters up to 10 % off. ``seed``: of
-    parameters, noise and encoder zeros. ``noise``: of the positions, rad.
+    Counted and noisy positions, dry friction, a delay, and parameters up to 10 % off, mass and
+    lengths up to 5 %. ``seed``: of parameters, noise and encoder zeros. ``noise``: of the
+    positions, rad.
     """
     rng = np.random.default_rng([seed, 7])
     belief = rotary_pendulum()
-    truth = {"I_e": 0.0036, "d_e": 0.073, "a_e": 0.1285}
-    truth = {k: v * (1 + 0.1 * rng.uniform(-1, 1)) for k, v in truth.items()}
+    off = {"I_e": 0.1, "d_e": 0.1, "a_e": 0.1, "m": 0.05, "l": 0.05, "r_o": 0.05}
+    values = {p.name: p.value for p in belief.parameters}
+    truth = {k: values[k] * (1 + most * rng.uniform(-1, 1)) for k, most in off.items()}
     friction = {"theta": 0.03, "phi": 0.0003}
     bench = Bench(
         belief.with_parameters(**truth),
@@ -53,16 +58,31 @@ def rig_in_the_class(
         encoders=dict.fromkeys(friction, Encoder(2 * math.pi / 4096, noise=noise)),
         timing=Timing(0.001, measurement_delay=0.002, steps=2),
     )
-    known = truth | {"delay": 0.002, "l": 0.1675, "r_o": 0.215}
+    known = truth | {"delay": 0.002}
     known |= {f"friction_{name}": level for name, level in friction.items()}
     return belief, RealisticRig(bench, rest_state(belief), seed), known
 
 
+def in_proportion(known: Mapping[str, float], mass: float) -> dict[str, float]:
+    """Return what there is to find with a mass of the pendulum that is held, kg: without the mass.
+
+    The motion is the same where torques, inertias and friction are so many times as large.
+    """
+    share = mass / known["m"]
+    same = {"delay", "l", "r_o"}
+    return {k: v if k in same else share * v for k, v in known.items() if k != "m"}
+
+
 def deviations(seed: int, noise: float) -> Deviations:
-    """Return (estimate − truth)/(standard error) of every quantity that is known."""
+    """Return (estimate − truth)/(standard error) of every quantity that is known.
+
+    Of what is in proportion to the mass: in proportion to the one that was held or identified.
+    """
     belief, rig, known = rig_in_the_class(seed, noise)
     u = doublets(PUSH, WIDTHS, PAUSE, rig.period)[:, None]
-    found = identify(belief, rest_state(belief), perform(rig, u, [3.0, 3.0])).estimates
+    identified = identify(belief, rest_state(belief), perform(rig, u, [3.0, 3.0]))
+    found, mass = identified.estimates, {p.name: p.value for p in identified.mechanism.parameters}
+    known = in_proportion(known, mass["m"])
     return {k: (found[k].value - v) / found[k].error for k, v in known.items() if k in found}
 
 
@@ -159,7 +179,8 @@ def parameter_table(found: Identification) -> Table:
         for e in found.estimates.values()
     ]
     heads = ("identified", "value, 95 %", "unit", "model", "what it is")
-    return table(heads, rows, left=("unit", "what it is"), whole=heads[:4])
+    note = "95 %: of noise and counting. What the model leaves out comes on top"
+    return table(heads, rows, left=("unit", "what it is"), whole=heads[:4], note=note)
 
 
 def coverage_table(rows: Sequence[CoverageRow]) -> Table:
@@ -203,8 +224,12 @@ def summary(found: BringUp) -> tuple[str, ...]:
     if identified is not None and identified.held:
         lines.append(
             f"Held at the model's values, for the motion does not tell them apart: "
-            f"{', '.join(identified.held)}; what is identified is in proportion to them."
+            f"{', '.join(identified.held)}. The intervals are for these values."
         )
+        for name, elasticity in identified.elasticities.items():
+            felt = sorted(elasticity, key=lambda k: -abs(elasticity[k]))[:SHOWN]
+            words = [f"{k} {elasticity[k]:+.1f} %" for k in felt if abs(elasticity[k]) >= 0.05]
+            lines.append(f"  With {name} 1 % larger: {', '.join(words) or 'the same'}.")
     if not found.wrong:
         looked = (
             "" if identified is not None else " so far: delay and parameters were not looked at"
@@ -256,6 +281,7 @@ def files(
             name: {"value": e.value, "low": e.low, "high": e.high, "unit": e.unit}
             for name, e in estimates.items()
         },
+        "held": {} if identified is None else dict(identified.elasticities),
     }
     written = {"findings.json": manifest("undertow bench", request, **facts)}
     record = found.record
