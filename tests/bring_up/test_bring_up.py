@@ -266,7 +266,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
 def test_a_mass_beside_a_known_inertia_is_identified_with_the_lengths(seed: int) -> None:
     """A Furuta pendulum whose arm's inertia is known: nothing has to be held.
 
-    Where the mass was held, 3 % off, the arm's length came out 1 % off, ± 0.01 %.
+    The mass is 4 % off. Where it was held, 3 % off, the arm's length came out 1 % off, ± 0.01 %.
     """
     theta, phi = ut.Coordinate("theta", "rad"), ut.Coordinate("phi", "rad")
     named = {"m_p": (0.2, "kg"), "l_p": (0.3, "m"), "r": (0.2, "m")}
@@ -282,13 +282,14 @@ def test_a_mass_beside_a_known_inertia_is_identified_with_the_lengths(seed: int)
     )  # fmt: skip
     rng = np.random.default_rng(seed)
     truth = {name: value * rng.uniform(0.95, 1.05) for name, (value, _) in named.items()}
-    rig = RealisticRig(plausible_rig(belief.with_parameters(**truth)), rest_state(belief), seed)
-    truth = {p.name: p.value for p in rig.mechanism.parameters}
+    truth["m_p"] = 0.2 * (0.96, 1.04)[seed % 2]
+    bench = replace(plausible_rig(belief.with_parameters(**truth)), tolerance={})
+    rig = RealisticRig(bench, rest_state(belief), seed)
     u = doublets(0.25, [0.05, 0.1, 0.2, 0.1, 0.05, 0.2, 0.15, 0.3], 0.3, rig.period)[:, None]
     found = identify(belief, rest_state(belief), perform(rig, u, [3.0, 3.0]))
     assert found.held == ()
     for name, value in truth.items():
-        assert found.estimates[name].value == pytest.approx(value, rel=0.003), name
+        assert found.estimates[name].value == pytest.approx(value, rel=0.005), name
 
 
 def test_what_was_done_is_not_done_again(tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ import pytest
 import sympy as sp
 
 import undertow as ut
-from support import rest_slow
 from undertow.base import InfeasibleError, InvalidInputError
 from undertow.cascade import Admission, CascadeState, cost_gate
 from undertow.cascade.simulation import moving_loops
@@ -137,16 +136,14 @@ def test_a_jump_of_the_target_is_planned_on_what_was_learnt(pendulum: ut.Mechani
     assert abs(naive.predicted - costs[2]) > 0.05 * costs[2]
 
 
-@pytest.mark.parametrize("count", rest_slow([1, 2], 1))
-def test_a_cascade_holds_plants_that_differ_from_its_model(
-    count: int, pendulum: ut.Mechanism
-) -> None:
+@pytest.mark.slow
+def test_a_cascade_holds_plants_that_differ_from_its_model(pendulum: ut.Mechanism) -> None:
     """With no argument of its own: the exact model meets the singularity on these plants."""
     objective = ut.MinimumTime(horizon=6.0)
     cascade = ut.Cascade(pendulum, objective)
     exact = replace(cascade, belief="exact")
     lost, times = 0, []
-    for k in range(count):
+    for k in range(2):
         rng = np.random.default_rng([5, k])
         plant = changed(pendulum, {k: rng.uniform(-part, part) for k, part in SPREAD.items()})
         run = cascade.simulate(phi=ut.deg(30), plant=plant)

@@ -92,16 +92,8 @@ def accuracy(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return accuracy
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "rotary_pendulum",
-        *(  # kernels of their own
-            pytest.param(name, marks=pytest.mark.slow)
-            for name in ("pendubot", "two_motor_three_link")
-        ),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["rotary_pendulum", "pendubot", "two_motor_three_link"])
 def test_motions_agree_with_a_reference_that_shares_no_code(
     accuracy: ModuleType, name: str
 ) -> None:

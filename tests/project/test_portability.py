@@ -92,12 +92,13 @@ def without_posix(code: str, folder: Path) -> None:
     assert done.returncode == 0, done.stderr[-3000:]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "code",
     [
         pytest.param(IMPORT_ALL + USE, id="import and simulate"),
-        pytest.param(EXPORT, id="export", marks=pytest.mark.slow),
-        pytest.param(CERTIFY, id="certify", marks=pytest.mark.slow),
+        pytest.param(EXPORT, id="export"),
+        pytest.param(CERTIFY, id="certify"),
     ],
 )
 def test_nothing_asks_for_posix(code: str, tmp_path: Path) -> None:

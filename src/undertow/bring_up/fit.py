@@ -443,6 +443,9 @@ class Fit:
             start = self.without(v, free, z)
             without = self.solve(fewer, start, 1e-5)
             higher = float((self.residual(fewer, without) ** 2).sum())
+            if higher < cost:  # so the least squares had not been reached
+                z = self.solve(free, _values(fewer, without) | {v.name: v.nominal}, 1e-5)
+                cost = float((self.residual(free, z) ** 2).sum())
             if higher < (1 + NEEDED) * cost:
                 cost, free, z = higher, fewer, without
         progress("beginning again beside it", 1 - 0.5 / len(ROUTES))
