@@ -276,19 +276,6 @@ class Fit:
         passive = float(np.abs(mechanism.forces(0.0, x0 + 0.1, np.zeros(mechanism.n))).max())
         self.candidates = candidates(mechanism, 0.01 * max(passive, 1e-3), record)
 
-    def without(self, v: Quantity, free: list[Quantity], z: FloatArray) -> dict[str, float]:
-        """Values of the others, to first order, where a free quantity is held at the model's."""
-        fewer = [other for other in free if other is not v]
-        kept = np.array([a for a, other in zip(z, free, strict=True) if other is not v])
-        change = v.nominal / v.scale - float(z[free.index(v)])
-        return _values(fewer, kept + change * self.shifts(fewer, kept, [v])[:, 0])
-
-    def shifts(self, free: list[Quantity], z: FloatArray, held: list[Quantity]) -> FloatArray:
-        """Change of the scaled variables by all of a held one more, to first order, (p, h)."""
-        start = self._start(held, {v.name: v.nominal for v in held})
-        J = self.jacobian([*free, *held], np.concatenate([z, start]))
-        return np.asarray(-np.linalg.pinv(J[:, : len(free)]) @ J[:, len(free) :])
-
     def look_at(self, piece: float, part: float) -> None:
         """Fit the first part of the motion from here on, in pieces so long, s.
 
@@ -352,6 +339,10 @@ class Fit:
         away = np.nan_to_num(away * np.sqrt(weights), nan=1e6, posinf=1e6, neginf=-1e6)
         return np.asarray(np.clip(away, -1e6, 1e6).T.ravel())
 
+    def cost(self, free: list[Quantity], z: FloatArray) -> float:
+        """The sum of their squares."""
+        return float((self.residual(free, z) ** 2).sum())
+
     def jacobian(
         self, free: list[Quantity], z: FloatArray, here: FloatArray | None = None
     ) -> FloatArray:
@@ -369,6 +360,19 @@ class Fit:
         return (
             np.array(columns).reshape(len(free), -1).T if free else np.empty((self.moved.size, 0))
         )
+
+    def without(self, v: Quantity, free: list[Quantity], z: FloatArray) -> dict[str, float]:
+        """Values of the others, to first order, where a free quantity is held at the model's."""
+        fewer = [other for other in free if other is not v]
+        kept = np.array([a for a, other in zip(z, free, strict=True) if other is not v])
+        change = v.nominal / v.scale - float(z[free.index(v)])
+        return _values(fewer, kept + change * self.shifts(fewer, kept, [v])[:, 0])
+
+    def shifts(self, free: list[Quantity], z: FloatArray, held: list[Quantity]) -> FloatArray:
+        """Change of the scaled variables by all of a held one more, to first order, (p, h)."""
+        start = self._start(held, {v.name: v.nominal for v in held})
+        J = self.jacobian([*free, *held], np.concatenate([z, start]))
+        return np.asarray(-np.linalg.pinv(J[:, : len(free)]) @ J[:, len(free) :])
 
     def _start(self, variables: list[Quantity], values: Mapping[str, float]) -> FloatArray:
         start = [values.get(v.name, v.start) / v.scale for v in variables]
@@ -430,7 +434,7 @@ class Fit:
             part = number / len(ROUTES)
             progress("which quantities the motion tells apart", part)
             free, z = self.follow(route, progress, part)
-            cost = float((self.residual(free, z) ** 2).sum())
+            cost = self.cost(free, z)
             if best is None or cost < best[0]:
                 best = cost, free, z
             if best[0] <= ENOUGH * self.moved.size:
@@ -440,20 +444,19 @@ class Fit:
         sure = self.choose(_values(free, z), [], (), DOUBTFUL)
         for v in reversed([v for v in free if v not in sure and math.isfinite(v.nominal)]):
             fewer = [other for other in free if other is not v]
-            start = self.without(v, free, z)
-            without = self.solve(fewer, start, 1e-5)
-            higher = float((self.residual(fewer, without) ** 2).sum())
+            rest = self.solve(fewer, self.without(v, free, z), 1e-5)
+            higher = self.cost(fewer, rest)
             if higher < cost:  # so the least squares had not been reached
-                z = self.solve(free, _values(fewer, without) | {v.name: v.nominal}, 1e-5)
-                cost = float((self.residual(free, z) ** 2).sum())
+                z = self.solve(free, _values(fewer, rest) | {v.name: v.nominal}, 1e-5)
+                cost = self.cost(free, z)
             if higher < (1 + NEEDED) * cost:
-                cost, free, z = higher, fewer, without
+                cost, free, z = higher, fewer, rest
         progress("beginning again beside it", 1 - 0.5 / len(ROUTES))
         for v in free:
             values = _values(free, z)
             if v.name.startswith(SHARP) and values[v.name] > 0:
                 other = self.solve(free, values | {v.name: 0.0}, 1e-5)
-                lower = float((self.residual(free, other) ** 2).sum())
+                lower = self.cost(free, other)
                 if lower < cost:
                     cost, z = lower, other
         return free, z
