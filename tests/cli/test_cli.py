@@ -191,6 +191,8 @@ def test_version_and_bare_call() -> None:
         (("certify", RIG, "--horizon", "60"), "60, without --run", "with --run"),
         (("certify", RIG, "--seed", "2"), "2, without --run", "with --run"),
         (("certify", RIG, "--hold", "0"), "0, without --loop", "loop's proof"),
+        (("certify", RIG, "--bench", "srv02", "--hold", "1"), "1, with --bench", "left out"),
+        (("certify", "cart_pendulum", "--bench", "srv02"), "of 'cart_pendulum'", "--bench usual"),
         (("verify", "none.json", "--seconds", "600"), "600, without --both", "second checker"),
         (("show", "run.db", "--objective", "effort"), "effort, with a log", "for a mechanism"),
         (("show", "run.db", "--seed", "0"), "0, with a log", "for a mechanism"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,10 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 import undertow as ut
-from undertow.base import Verdict
+from undertow.base import InvalidInputError, Verdict
 from undertow.cli import app
 from undertow.closed_loop.figures import COLOURS
+from undertow.plants.bench import srv02_rig
 from undertow.proofs import LoopClaim, RegionClaim, read_certificate
 from undertow.proofs.gate import GatePolicy, certified_gate
 from undertow.proofs.region.lyapunov import LyapunovFunction
@@ -28,6 +30,7 @@ from undertow.studies.certification import (
     Certified,
     appendix_report,
     certify_appendix,
+    certify_bench,
     certify_run,
     decide,
     figures,
@@ -36,6 +39,7 @@ from undertow.studies.certification import (
     run_report,
     subject_report,
 )
+from undertow.studies.certification.bench import BenchLoop
 from undertow.studies.paper.appendix import CASES
 
 pytest.importorskip("flint", reason="the appendix's cases take the extra undertow[appendix]")
@@ -323,3 +327,71 @@ def test_friction_that_a_motion_leaves_out_is_told_of(run: ut.Run) -> None:
     free = RIG.with_disturbance_bounds(1.0, 0.0).with_input_limit(math.inf)
     shown = motion.motion_report(free, GOAL, start, run.trajectory, run.surfaces[0], run)
     assert told not in text(shown)
+
+
+BENCH = srv02_rig()
+WORDS = ("1.5 ms from reading to action", "theta 0.03", "a_e ± 12 %", "standard deviation")
+needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
+
+
+def on_bench(loop_seconds: float, **start: float) -> Certified:
+    """What is known of the loop of the paper's bench; law and C are tried on a few rigs."""
+    rig = BENCH.mechanism
+    surface, far = ut.first_surface(rig), rig.state(**start)
+    return certify_bench(BENCH, surface, far, loop_seconds=loop_seconds, trials=(6, 3))
+
+
+@needs_gcc
+@pytest.mark.slow
+def test_the_loop_of_a_bench_is_proved_as_held_and_tried_from_what_is_proved() -> None:
+    """Period and layer are those of a run; the file's claim is decided again."""
+    subject = on_bench(600.0, phi=math.radians(1)).subject
+    (held,) = (c.claim for c in subject.claims if c.kind == "closed loop")
+    claim = LoopClaim.of(held)
+    assert claim.period == BENCH.timing.period
+    assert float(claim.box(BENCH.mechanism)[1, 1]) == pytest.approx(math.radians(1))
+    assert claim.decide(BENCH.mechanism, subject.surface, subject.reaching)
+    assert ["|phi| ≤ 0.01745," in verdict.claim for verdict in subject.remarks[-2:]] == [True] * 2
+
+
+@needs_gcc
+@pytest.mark.slow
+def test_the_law_and_the_exported_c_are_tried_with_what_a_proof_leaves_out() -> None:
+    """Where no loop is proved, from up to the start; what is left out stands above all proofs."""
+    found = on_bench(1e-9, phi=0.3)
+    run = ut.runtime.reaching_for(ut.runtime.estimator_for(BENCH.mechanism, BENCH))
+    assert found.subject.reaching == run
+    law, exported = found.subject.remarks[-2:]
+    assert (law.kind, exported.kind) == ("sampled", "sampled")
+    assert (law.details["trials"], exported.details["trials"]) == (6, 3)
+    assert "|phi| ≤ 0.3," in law.claim
+    assert law.margin == pytest.approx(0.001 ** (1 / 6))  # 1 − p with (1 − p)⁶ = 1 − confidence
+    shown = text(subject_report(BENCH.mechanism, found), 80)
+    first = shown.index("Routh")
+    assert all(0 < shown.index(words) < first for words in WORDS)
+    assert shown.index("simulated runs") > first
+
+
+def test_a_bench_that_a_law_does_not_bear_is_refuted_with_a_start() -> None:
+    """An arm that sticks with more than the motor has: no run comes home."""
+    stuck = BENCH.with_friction(200.0)
+    law = ut.runtime.reaching_for(ut.runtime.estimator_for(BENCH.mechanism, BENCH))
+    box = np.outer(BENCH.mechanism.state(phi=1.0), [0.2, 0.3])
+    verdict = BenchLoop(stuck, ut.first_surface(BENCH.mechanism), law, box, 3.0, 3, 1).tried()
+    assert (verdict.kind, verdict.margin) == ("refuted", -1.0)
+    assert 0.2 <= verdict.witness["phi"] <= 0.3
+
+
+def test_the_period_of_a_bench_that_is_certified_is_whole_ms() -> None:
+    odd = BENCH.with_timing(period=0.0004)
+    with pytest.raises(InvalidInputError, match=r"0\.4 ms"):
+        certify_bench(odd, ut.first_surface(BENCH.mechanism), BENCH.mechanism.state())
+
+
+def test_a_certificate_in_python_takes_the_bench_of_its_mechanism_alone() -> None:
+    surface = ut.first_surface(RIG)
+    with pytest.raises(InvalidInputError, match="mechanism of the bench"):
+        ut.certify(RIG, surface, bench=BENCH)
+    own = replace(BENCH, mechanism=RIG)
+    with pytest.raises(InvalidInputError, match="left out"):
+        ut.certify(RIG, surface, bench=own, hold=2)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.console import RenderableType
@@ -41,6 +42,7 @@ from undertow.objective import USUAL
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from undertow.plants import Bench
     from undertow.studies.certification import Certified
 
 
@@ -57,6 +59,20 @@ def _box(mechanism: Mechanism, within: list[str] | None) -> dict[str, tuple[floa
     return box
 
 
+def _bench(mechanism: Mechanism, word: str | None) -> Bench | None:
+    """Return the bench of a word, its mechanism's parameters as they are here."""
+    if word is None:
+        return None
+    from undertow.plants.bench import plausible_rig, srv02_rig
+
+    if word == "usual":
+        return plausible_rig(mechanism)
+    published = srv02_rig()
+    name, remedy = published.mechanism.name, "Take --bench usual, of any mechanism"
+    require(mechanism.name == name, "--bench srv02", f"of '{mechanism.name}'", name, remedy)
+    return replace(published, mechanism=mechanism)
+
+
 @command(
     "undertow certify rotary_pendulum --surface 'lambda_a=-1.59 alpha_u=1.96 lambda_u=12.1'",
     "undertow certify cart_pendulum --seconds 30 --out proof",
@@ -65,6 +81,7 @@ def _box(mechanism: Mechanism, within: list[str] | None) -> dict[str, tuple[floa
     "undertow certify tora --loop --seconds 0 --start theta=0.3rad --start x=0.02m --out proof",
     "undertow certify rotary_pendulum --loop --seconds 0 --start phi=10deg --hold 1",
     "undertow certify rotary_pendulum --loop --seconds 0 --start phi=5deg --hold 1 --within m=2",
+    "undertow certify rotary_pendulum --bench srv02 --out proof",
     "undertow certify --appendix",
     "undertow certify --appendix --loop --set d_e=0.073 --out proof",
     "undertow certify model.py:make",
@@ -83,6 +100,7 @@ def certify(
     loop_seconds: float | None = None,
     hold: int = 0,
     within: list[str] | None = None,
+    bench: Literal["srv02", "usual"] | None = None,
     seed: options.Seed = 0,
     out: Path | None = None,
 ) -> None:
@@ -114,6 +132,11 @@ def certify(
     within : NAME=PERCENT
         A parameter of the plant that is known only to within so many per cent: the region on the
         surface is proved once more with it, and the loop. Repeatable.
+    bench
+        Certify the loop that undertow run closes on this bench, keeping the surface: its period and
+        boundary layer, and --loop. What is not in the proof is said above it; law and exported C
+        are tried with that on random rigs. srv02: the paper's, of the rotary pendulum. usual: of
+        usual quality, of any mechanism. --seconds is 0, and --loop-seconds 150, by default.
     out
         Folder for certificate.json and the figures.
     """
@@ -125,7 +148,7 @@ def certify(
     brief = "left out: of a run, stability and terminal sets are proved"
     timed, own = seconds is None or 0 <= seconds < 1e5, "an option of the loop's proof"
     effort = certification.LOOP_SECONDS if loop_seconds is None else loop_seconds
-    region = not run and (bool(seconds) if seconds is not None or appendix else True)
+    region = not run and (bool(seconds) if seconds is not None or appendix or bench else True)
     require(appendix == (name is None), "undertow certify", given, "a mechanism, or --appendix")
     require(not (run and surface is not None), "--surface with --run", surface, alone)
     given = "left out: the paper's cases have surfaces and starts of their own"
@@ -136,11 +159,13 @@ def certify(
     require(not (run and seconds), "--seconds", f"{seconds} s, with --run", brief)
     require(not (run and loop), "--loop", "with --run", brief)
     require(0 < effort < 1e5, "--loop-seconds", loop_seconds, "in (0, 100000)")
+    needs(bench is None, "with --bench", "left out", "run", "appendix", "loop", "hold")
+    loop = loop or bench is not None
     needs(loop, "without --loop", own, "loop_seconds", "hold")
     bears = loop or region or not within
     require(bears, "--within", "without a region and --loop", "an option of their proofs")
     require(0 <= hold <= 100, "--hold", hold, whole)
-    held = not (loop and within) or hold
+    held = not (loop and within) or hold or bench is not None
     require(held, "--within with --loop", "no --hold", "a held input")
     check_out(out)
     found: dict[str, Certified] = {}
@@ -149,7 +174,7 @@ def certify(
     if run:
         task = parse_task(str(name), start, objective, horizon, settings=setting)
     mechanism = task[0] if task else mechanism_named(str(name or "rotary_pendulum"), setting)
-    uncertain = _box(mechanism, within)
+    uncertain, place = _box(mechanism, within), _bench(mechanism, bench)
     if not (run or appendix):
         usual = bool(start or mechanism.start)  # without a start there is stability to prove
         x0 = parse_start(mechanism, start) if usual else mechanism.state()
@@ -177,6 +202,13 @@ def certify(
                 uncertain=uncertain, kept=keep, progress=progress,
             )  # fmt: skip
             reports.append(certification.appendix_report(cases))
+        elif place is not None:
+            own_effort = certification.SEARCH if loop_seconds is None else loop_seconds
+            one = certification.certify_bench(
+                place, used, x0, seconds=seconds or 0.0, loop_seconds=own_effort,
+                uncertain=uncertain, kept=keep, progress=progress,
+            )  # fmt: skip
+            keep(one)
         else:
             one = certification.certify_surface(
                 mechanism, used, x0, reaching_law=usual_reaching(mechanism, used),

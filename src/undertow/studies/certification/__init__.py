@@ -1,5 +1,6 @@
 """What `undertow certify` and `undertow verify` do: claims composed, shown, drawn, written."""
 
+from undertow.studies.certification.bench import SEARCH, certify_bench
 from undertow.studies.certification.decide import (
     LOOP_SECONDS,
     Certified,
@@ -19,12 +20,14 @@ from undertow.studies.certification.report import (
 
 __all__ = [
     "LOOP_SECONDS",
+    "SEARCH",
     "Certified",
     "Verification",
     "appendix_report",
     "certificate_files",
     "certify",
     "certify_appendix",
+    "certify_bench",
     "certify_run",
     "certify_surface",
     "loop_figure",

@@ -69,7 +69,8 @@ class Certified:
 
     ``title``: its name in tables. ``subject``: claims and remarks, as they go into the certificate.
     ``region``: the proved region on the surface, where there is one. ``interval``: for a case of
-    the appendix, whether R ≻ 0 on its Ĩ. ``seconds``: how long it took, s.
+    the appendix, whether R ≻ 0 on its Ĩ. ``seconds``: how long it took, s. ``left_out``: what the
+    loop of a bench has and no proof here, by name.
     """
 
     title: str
@@ -77,6 +78,7 @@ class Certified:
     region: ProvedRegion | None = None
     interval: Verdict | None = None
     seconds: float = 0.0
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
 
 #: Takes what is known of a surface by now.

@@ -11,9 +11,11 @@ import numpy as np
 from undertow.base import Progress, checked, no_progress, positive, require, versions
 from undertow.law import ReachingLaw, Surface, usual_reaching
 from undertow.models import Mechanism, StateLike
+from undertow.plants import Bench
 from undertow.proofs import Certificate, read_certificate
 from undertow.proofs.claims.verify import Checked
 from undertow.proofs.claims.verify import verify as decide
+from undertow.studies.certification.bench import certify_bench
 from undertow.studies.certification.decide import LOOP_SECONDS, certify_surface
 
 
@@ -29,6 +31,7 @@ def certify(
     loop_seconds: float = LOOP_SECONDS,
     hold: int = 0,
     uncertain: Mapping[str, tuple[float, float]] | None = None,
+    bench: Bench | None = None,
     progress: Progress | None = None,
     **state: float,
 ) -> Certificate:
@@ -56,6 +59,11 @@ def certify(
     uncertain
         Plant parameters that lie in [low, high] instead of being the law's own: for that proof,
         with an input that is held, and for a second region on the surface.
+    bench
+        Certify the loop that a run closes on this bench, whose mechanism it must be: ``loop`` and
+        ``hold`` are left out then, for its period says them, and the usual ``reaching`` law is that
+        of a run. Law and exported C are tried on random rigs besides: remarks of the subject, which
+        no file keeps.
     progress
         Called with (what, part done).
 
@@ -82,6 +90,13 @@ def certify(
     """
     positive("time of the search, s", seconds, zero=True)
     positive("time of the loop's search, s", loop_seconds)
+    if bench is not None:
+        same = bench.mechanism.fingerprint == mechanism.fingerprint
+        require(
+            same, "mechanism of the bench", f"another '{bench.mechanism.name}'", "the one given"
+        )
+        require(not (loop or hold), "loop and hold, with a bench", (loop, hold), "left out")
+        loop, hold = True, 1
     given, own = "without loop=True", "left out: it is for the closed loop's proof"
     require(loop or not hold, "hold", f"{hold}, {given}", own)
     require(loop or loop_seconds == LOOP_SECONDS, "loop_seconds", f"{loop_seconds:g}, {given}", own)
@@ -91,18 +106,19 @@ def certify(
     require(hold or not (loop and uncertain), "uncertain, with loop=True", uncertain, held)
     known = x0 is not None or state or mechanism.start
     start = mechanism.initial_state(x0, state) if known else np.zeros(2 * mechanism.n)
-    certified = certify_surface(
-        mechanism,
-        surface,
-        start,
-        reaching_law=usual_reaching(mechanism, surface) if reaching is None else reaching,
-        seconds=seconds,
-        loop=loop,
-        loop_seconds=loop_seconds,
-        hold=hold,
-        uncertain=uncertain,
-        progress=progress or no_progress,
-    )
+    progress = progress or no_progress
+    if bench is not None:
+        certified = certify_bench(
+            bench, surface, start, reaching_law=reaching, seconds=seconds,
+            loop_seconds=loop_seconds, uncertain=uncertain, progress=progress,
+        )  # fmt: skip
+    else:
+        certified = certify_surface(
+            mechanism, surface, start,
+            reaching_law=usual_reaching(mechanism, surface) if reaching is None else reaching,
+            seconds=seconds, loop=loop, loop_seconds=loop_seconds, hold=hold, uncertain=uncertain,
+            progress=progress,
+        )  # fmt: skip
     return Certificate.of(mechanism, [certified.subject], versions())
 
 

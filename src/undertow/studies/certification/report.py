@@ -10,7 +10,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from undertow.base import Verdict, inward, mark
+from undertow.base import Verdict, facts, inward, mark
 from undertow.base import artefacts as results
 from undertow.cascade import Run
 from undertow.models import Mechanism
@@ -60,10 +60,17 @@ def _claims(certified: Certified) -> Table:
 
 
 def subject_report(mechanism: Mechanism, certified: Certified) -> RenderableType:
-    """Return all claims of one surface with verdict, margin, witness and method."""
-    head = Text(f"{mechanism.name}, {certified.subject.surface}")
-    seconds = Text(f"{certified.seconds:.1f} s", style="dim")
-    return Group(head, "", _claims(certified), seconds)
+    """Return all claims of one surface with verdict, margin, witness and method.
+
+    What they leave out of a bench stands above them.
+    """
+    lines: list[RenderableType] = [Text(f"{mechanism.name}, {certified.subject.surface}"), ""]
+    if certified.left_out:
+        lines += [
+            Text("In no proof below. Runs on random rigs, sampled, have all but other surfaces:"),
+            facts(certified.left_out.items()), "",
+        ]  # fmt: skip
+    return Group(*lines, _claims(certified), Text(f"{certified.seconds:.1f} s", style="dim"))
 
 
 def appendix_report(cases: Sequence[Certified]) -> RenderableType:
