@@ -167,7 +167,10 @@ class BenchLoop:
             f"{name} {value:.2g}"
             for name, value in zip(self.mechanism.state_names, ratio.tolist(), strict=True)
         )
-        more = f"; root mean square of the estimate's errors, in stated deviations: {errors}"
+        more = (
+            "; root mean square of what the estimate was off, in deviations that are stated at "
+            f"rest: {errors}"
+        )
         return self._verdict(words, self.rigs, lost, more)
 
     def exported_tried(self, progress: Progress = no_progress) -> Verdict:
