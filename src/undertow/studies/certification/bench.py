@@ -132,7 +132,7 @@ class BenchLoop:
 
     @property
     def _seconds(self) -> float:
-        return min(LONGEST, max(SHORTEST, DECAYS / self.rate))
+        return min(LONGEST, max(SHORTEST, float(np.ceil(DECAYS / self.rate))))
 
     @property
     def _words(self) -> str:
