@@ -574,6 +574,7 @@ def test_the_command_line_runs_shows_and_repeats_a_shard(serial: Path, tmp_path:
             {"axes": {a: {"from": 0.0, "to": 1.0, "count": 10**7} for a in ("phi", "theta")}},
             "shards of the campaign.*1e\\+06",
         ),
+        ({"axes": {"phi": {"from": -90.0, "to": 90.0, "count": 3}}}, "-90 to 90 rad.*two turns"),
         ({"axes": {}}, "states among theta"),
         ({"at": {"phi": 0.1}}, "one of theta"),
         ({"surface": [1.0, 2.0]}, "4 numbers"),

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import RenderableType
 
-from undertow.base import InvalidInputError
+from undertow.base import InvalidInputError, require
 from undertow.models import FloatArray, Mechanism, Parameter
 from undertow.studies.campaign.definition import Settings
 
@@ -184,6 +184,10 @@ class Study(ABC):
         return mesh[0].shape, [np.asarray(v, dtype=float).ravel() for v in mesh]
 
 
+#: The largest angle on an axis, rad: beyond two turns it is likely to be in degrees.
+MOST_ANGLE = 4 * math.pi
+
+
 def axes_of(settings: Settings, units: Mapping[str, str]) -> tuple[Axis, ...]:
     """Take the ``axes``: tables ``from``, ``to``, ``count``, by names that have units."""
     axes = []
@@ -196,6 +200,10 @@ def axes_of(settings: Settings, units: Mapping[str, str]) -> tuple[Axis, ...]:
                 value=f"{count} from {first:g} to {last:g}",
                 limit="1 where both ends are the same, else at least 2",
             )
+        ends, turns = f"{first:g} to {last:g} rad", f"within ±{MOST_ANGLE:.4g} rad, two turns"
+        remedy = "Give radians: 90 degrees are 1.5708"
+        small = units[name] != "rad" or max(abs(first), abs(last)) <= MOST_ANGLE
+        require(small, settings.what(f"axes.{name}"), ends, turns, remedy)
         values = np.linspace(first, last, count)
         table.finish()
         axes.append(Axis(name, values, units[name]))
