@@ -338,7 +338,7 @@ def on_bench(loop_seconds: float, **start: float) -> Certified:
     """What is known of the loop of the paper's bench; law and C are tried on a few rigs."""
     rig = BENCH.mechanism
     surface, far = ut.first_surface(rig), rig.state(**start)
-    return certify_bench(BENCH, surface, far, loop_seconds=loop_seconds, trials=(6, 3))
+    return certify_bench(BENCH, surface, far, loop_seconds=loop_seconds, trials=(48.0, 24.0))
 
 
 @needs_gcc
@@ -377,7 +377,7 @@ def test_a_bench_that_a_law_does_not_bear_is_refuted_with_a_start() -> None:
     stuck = BENCH.with_friction(200.0)
     law = ut.runtime.reaching_for(ut.runtime.estimator_for(BENCH.mechanism, BENCH))
     box = np.outer(BENCH.mechanism.state(phi=1.0), [0.2, 0.3])
-    verdict = BenchLoop(stuck, ut.first_surface(BENCH.mechanism), law, box, 3.0, 3, 1).tried()
+    verdict = BenchLoop(stuck, ut.first_surface(BENCH.mechanism), law, box, 3.0, 24.0).tried()
     assert (verdict.kind, verdict.margin) == ("refuted", -1.0)
     assert 0.2 <= verdict.witness["phi"] <= 0.3
 

@@ -31,9 +31,12 @@ from undertow.studies.certification.decide import Certified, Kept, certify_surfa
 from undertow.studies.trials.steering import keeping
 from undertow.studies.trials.trial import trial
 
-#: Random rigs that the law is tried on, and its exported C; states at which the two are compared;
-#: confidence of the bound on the share of rigs that are lost.
-RIGS, EXPORTED, COMPARED, CONFIDENCE = 300, 60, 10_000, 0.999
+#: How long the law is tried in all, and its exported C, s of simulated time: 300 and 60 runs of the
+#: shortest length, a rig each.
+TRIED, EXPORTED = 2400.0, 480.0
+
+#: States at which the two are compared; confidence of the bound on the share of rigs that are lost.
+COMPARED, CONFIDENCE = 10_000, 0.999
 
 #: Process time of the search for starts of the closed loop, s: with its proof and the trials it
 #: takes less than ten minutes.
@@ -53,7 +56,7 @@ def certify_bench(
     seconds: float = 0.0,
     loop_seconds: float = SEARCH,
     uncertain: Box | None = None,
-    trials: tuple[int, int] = (RIGS, EXPORTED),
+    trials: tuple[float, float] = (TRIED, EXPORTED),
     kept: Kept = no_keeping,
     progress: Progress = no_progress,
 ) -> Certified:
@@ -101,7 +104,8 @@ class BenchLoop:
     """The loop of a bench that keeps one surface; the bench's mechanism is the controller's model.
 
     ``starts``: the box of states, (2n, 2), in which trials begin. ``rate``: of the slowest motion
-    on the surface, 1/s. ``rigs``, ``exported``: how many the law and its C are tried on.
+    on the surface, 1/s. ``tried_for``, ``exported_for``: how long the law and its C are tried in
+    all, s of simulated time.
     """
 
     bench: Bench
@@ -109,8 +113,8 @@ class BenchLoop:
     law: ReachingLaw
     starts: FloatArray
     rate: float
-    rigs: int = RIGS
-    exported: int = EXPORTED
+    tried_for: float = TRIED
+    exported_for: float = EXPORTED
 
     @property
     def mechanism(self) -> Mechanism:
@@ -134,6 +138,10 @@ class BenchLoop:
     def _seconds(self) -> float:
         return min(LONGEST, max(SHORTEST, float(np.ceil(DECAYS / self.rate))))
 
+    def _runs(self, duration: float) -> int:
+        """How many runs take so long in all, s; one at least."""
+        return max(1, int(duration / self._seconds))
+
     @property
     def _words(self) -> str:
         size = np.abs(self.starts).max(axis=1)
@@ -149,7 +157,8 @@ class BenchLoop:
         """
         make = keeping(self.mechanism, self.surface, self.law)
         bench, off, lost = replace(self.bench, hand={}), list[FloatArray](), list[FloatArray]()
-        for seed in each(range(self.rigs), progress, lambda _: "runs on random rigs"):
+        count = self._runs(self.tried_for)
+        for seed in each(range(count), progress, lambda _: "runs on random rigs"):
             x0 = self._start(seed)
             run = trial(
                 self.mechanism, bench, make, x0, self._seconds, seed, estimator=self._estimator()
@@ -171,12 +180,13 @@ class BenchLoop:
             "; root mean square of what the estimate was off, in deviations that are stated at "
             f"rest: {errors}"
         )
-        return self._verdict(words, self.rigs, lost, more)
+        return self._verdict(words, count, lost, more)
 
     def exported_tried(self, progress: Progress = no_progress) -> Verdict:
         """Decide the same of the exported C, compiled here, beside how far its law differs."""
         words = f"{self._words}, the exported C holds random rigs of the bench"
         bench, lost = replace(self.bench, hand={}), list[FloatArray]()
+        count = self._runs(self.exported_for)
         try:
             controller = EmbeddedController(
                 self.mechanism, self.surface, self.law, self.bench.timing.period, KalmanStep()
@@ -184,7 +194,7 @@ class BenchLoop:
             with tempfile.TemporaryDirectory(prefix="undertow-") as folder:
                 build = Build(controller, Path(folder))
                 near = build.agreement(COMPARED)
-                for seed in each(range(self.exported), progress, lambda _: "runs of the C"):
+                for seed in each(range(count), progress, lambda _: "runs of the C"):
                     x0 = self._start(seed)
                     with build.start() as process:
                         rig = RealisticRig(bench, x0, seed)
@@ -196,7 +206,7 @@ class BenchLoop:
             f"; its law at {COMPARED} random states is Python's to within {near.output:.1e} of the "
             f"input limit; {controller.differentiator.description}, which predicts no delay"
         )
-        return self._verdict(words, self.exported, lost, more)
+        return self._verdict(words, count, lost, more)
 
     def _start(self, seed: int) -> FloatArray:
         return np.asarray(np.random.default_rng([seed, 1]).uniform(*self.starts.T))
