@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import signal
@@ -15,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 import undertow as ut
@@ -49,6 +51,7 @@ from undertow.studies.campaign.run import study_of
 from undertow.studies.survey import survey
 
 pytest.importorskip("zarr")
+xarray = pytest.importorskip("xarray")
 distributed = pytest.importorskip("distributed")
 cloudpickle = pytest.importorskip("cloudpickle")
 cloudpickle.register_pickle_by_value(sys.modules[__name__])
@@ -146,6 +149,24 @@ def test_every_executor_writes_the_same_bits(
 ) -> None:
     run(MAP, tmp_path / "other", **how)
     assert content(tmp_path / "other") == content(serial)
+
+
+def test_costs_of_contenders_are_compared_over_balanced_runs_alone() -> None:
+    """A run that was lost in the first second cost next to nothing."""
+    study = study_of(Definition.of(RIG, kind="plants", plants=3, controllers=["kept", "lqr"]))
+    found: dict[str, Any] = {
+        "kept_balanced": [1, 0, 1], "kept_settled": [1.0, np.inf, 2.0],
+        "kept_cost": [4.0, 0.001, 6.0], "kept_chatter": [7.0, 900.0, 9.0],
+        "lqr_balanced": [0, 0, -1], "lqr_settled": [np.inf, np.inf, np.nan],
+        "lqr_cost": [0.1, 0.2, np.nan], "lqr_chatter": [1.0, 1.0, np.nan],
+    }  # fmt: skip
+    data = xarray.Dataset({k: ("plant", np.array(v)) for k, v in found.items()})
+    data.attrs["title"] = "plants of a rig"
+    console = Console(width=100, record=True, file=io.StringIO())
+    console.print(*study.report(data))
+    rows = [line.split() for line in console.export_text().splitlines()]
+    assert ["kept", "2", "of", "3", "1.5", "5", "6", "8"] in rows
+    assert ["lqr", "0", "of", "2", "—", "—", "—", "—"] in rows
 
 
 @pytest.mark.slow

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from rich.console import RenderableType
 
+from undertow.base import number, table
 from undertow.cascade import Cascade
 from undertow.models import Mechanism
 from undertow.objective import USUAL
@@ -91,12 +93,31 @@ class RandomPlants(Study):
         found = self.unknown((len(numbers),))
         for name in self.controllers:
             make = self.controller(name)
-            for row, number in enumerate(numbers):
-                bench = self.plant(number)
+            for row, own in enumerate(numbers):
+                bench = self.plant(own)
                 outcome = trial(
-                    self.mechanism, bench, make, self.start, self.length, number,
+                    self.mechanism, bench, make, self.start, self.length, own,
                     objective=self.objective, told=self.bench,
                 )  # fmt: skip
                 for what in ("balanced", "settled", "cost", "chatter"):
                     found[f"{name}_{what}"][row] = getattr(outcome, what)
         return found
+
+    def report(self, data: Any) -> list[RenderableType]:
+        """Return the contenders side by side: numbers but the first are of balanced runs alone."""
+        unit, rows = self.objective.unit or "1", []
+        for name in self.controllers:
+            balanced = np.asarray(data[f"{name}_balanced"])
+            home = balanced == 1
+            numbers = [
+                np.asarray(data[f"{name}_{what}"])[home] for what in ("settled", "cost", "chatter")
+            ]
+            cells = [float(np.median(v)) if len(v) else np.nan for v in numbers]
+            worst = float(numbers[1].max()) if home.any() else np.nan
+            cells.insert(2, worst)
+            tried = int((balanced >= 0).sum())
+            shown = [number(v, ".4g") for v in cells]
+            rows.append([name, f"{int(home.sum())} of {tried}", *shown])
+        heads = ["", "balanced", "settled, s", f"cost, {unit}", "worst", "chatter, 1/s"]
+        title = f"{data.attrs['title']}: medians over balanced runs"
+        return [table(heads, rows, title=title, whole=heads)]
