@@ -274,7 +274,8 @@ def run(
     InfeasibleError
         When the first optimisation finds no admissible surface.
     InvalidInputError
-        For a rig that is none, or has another period than its controller.
+        For a rig that is none, or has another period than its controller; for a target where the
+        mechanism cannot rest or go, or that is due after the end of the run.
     ArtefactError
         When the rig cannot be read, or the log cannot be written.
     """
