@@ -16,6 +16,7 @@ from undertow.models import FloatArray
 RIG = ut.mechanisms.rotary_pendulum()
 GOAL = ut.objective_for(RIG, "effort", horizon=10.0)
 SURFACE = ut.first_surface(RIG)
+OTHER = ut.first_surface(ut.mechanisms.double_pendulum_on_a_cart())
 FREE = RIG.with_input_limit(np.inf)
 QUICK = ut.Plan((SURFACE,), reaching=(ut.ReachingLaw(200.0, 0.2),))
 
@@ -158,6 +159,7 @@ def test_stable_baselines3_s_loop_over_a_vector_balances() -> None:
     [
         (lambda: ut.policy(ut.ClosedLoop(RIG)), "surfaces of a policy"),
         (lambda: ut.policy(ut.Cascade(RIG), SURFACE), "surfaces of a policy"),
+        (lambda: ut.policy(ut.ClosedLoop(RIG), OTHER), "n = 3, m = 1, must be n = 2, m = 1"),
         (lambda: ut.policy(ut.ClosedLoop(RIG), SURFACE, period=0.01), "below 2 ε/η = 0.01"),
         (lambda: ut.policy(ut.ClosedLoop(RIG), QUICK), "below 2 ε/η = 0.002"),
         (lambda: ut.policy(ut.Cascade(RIG), period=0.003), "a whole part of the cascade's"),

@@ -228,6 +228,8 @@ def test_targets_are_refused_before_anything_moves(cascade: ut.Cascade) -> None:
             cascade.start(CRANE.state(), target, 3.0)
     with pytest.raises(InvalidInputError, match="all of its coordinates"):
         ut.Cascade(ut.mechanisms.pendubot(), belief="exact").start([0, 0, 0, 0], {"q_1": 0.1})
+    with pytest.raises(InvalidInputError, match="got 5 s, must be before the end of the run, 4 s"):
+        cascade.simulate(target=ut.SetPoints([(0, {"x": 1.0}), (5, {"x": 0.0})]), duration=4.0)
     with pytest.raises(InvalidInputError, match="each later than the one before"):
         ut.SetPoints([(1, {"x": 1.0}), (0, {"x": 2.0})])
 

@@ -22,7 +22,7 @@ from undertow.cascade import CascadeState
 from undertow.cli import app
 from undertow.display.live import Message, saved_page
 from undertow.display.live.page import FILES, content, encoded
-from undertow.display.live.server import OTHERS, PICTURES, Server, Viewer
+from undertow.display.live.server import FAREWELL, OTHERS, PICTURES, Server, Viewer
 from undertow.runtime import Columns, InlineWorker, Log, Runtime, SimulatedClock, about
 from undertow.studies.live import of_log
 
@@ -88,6 +88,18 @@ async def fetched(address: str, **headers: str) -> tuple[int, dict[str, str], by
                 return error.code, dict(error.headers), error.read()
 
     return await asyncio.to_thread(get)
+
+
+def test_a_viewer_that_no_longer_answers_does_not_hold_up_the_end() -> None:
+    """Ctrl-C waited ten seconds for a suspended page to say goodbye."""
+
+    async def look(server: Server) -> None:
+        async with connected(server) as line:
+            await line.recv()
+            (viewer,) = server.viewers.values()
+            assert viewer.socket.close_timeout == FAREWELL
+
+    serving(Counting(), look)
 
 
 def test_the_page_is_for_those_who_have_its_address() -> None:

@@ -330,6 +330,28 @@ def test_senseless_settings_are_refused(arm: ut.Mechanism) -> None:
     ):
         with pytest.raises(InvalidInputError):
             make()
+    name: Any = "arm"
+    refused: list[tuple[Callable[[], Estimator], str]] = [
+        (lambda: KalmanFilter(name), "mechanism of KalmanFilter: got 'arm'"),
+        (lambda: Measured(name), "mechanism of Measured: got 'arm'"),
+        (lambda: KalmanFilter(arm, belief=name), "belief of KalmanFilter: got 'arm'"),
+        (lambda: KalmanFilter(arm, resolution=name), "resolution of KalmanFilter: got 'arm'"),
+        (lambda: KalmanFilter(arm, delay=1e9), "delay of a Kalman filter: got 1e.12 periods"),
+        (lambda: Measured(arm, longest_gap=math.nan), "longest gap of measured velocities"),
+    ]
+    for wrong, words in refused:
+        with pytest.raises(InvalidInputError, match=words):
+            wrong()
+
+
+@pytest.mark.parametrize("kind", [Measured, FilteredDerivative, SuperTwisting, KalmanFilter])
+def test_an_estimate_starts_from_a_state(arm: ut.Mechanism, kind: type[Estimator]) -> None:
+    """Of 2n finite numbers: NaN stayed in the estimate for ever."""
+    estimator = kind(arm)
+    with pytest.raises(InvalidInputError, match=r"state 'phi' of .*got nan, must be a finite"):
+        estimator.reset([0.0, math.nan, 0.0, 0.0])
+    with pytest.raises(InvalidInputError, match=rf"state of '{arm.name}'"):
+        estimator.reset([0.0, 0.0])
 
 
 #: An estimator that knows of half a unit of disturbance.

@@ -245,6 +245,17 @@ def test_an_action_that_is_none_is_refused_in_one_environment_as_in_many(action:
     assert (many._lanes.x == begun).all()
 
 
+def test_a_step_before_reset_is_refused_in_one_environment_as_in_many() -> None:
+    """Many began by themselves, from starts that no seed gave."""
+    many = ut.vector_environment(RIG, num_envs=2)
+    for step in (
+        lambda: ut.environment(RIG).step(np.zeros(1)),
+        lambda: many.step(np.zeros((2, 1))),
+    ):
+        with pytest.raises(InvalidInputError, match=r"Call reset\(\) first"):
+            step()
+
+
 def test_seeds_and_options_that_are_none_are_refused() -> None:
     """A seed of 1.5 was 1; options that are no mapping, and 2.0 environments, raw errors."""
     many = ut.vector_environment(RIG, num_envs=2.0)  # type: ignore[arg-type]

@@ -191,6 +191,8 @@ def test_a_file_is_read_with_its_units(tmp_path: Path) -> None:
         ("t (s), x (m)\n1,0\n0,1\n", "times of a reference"),
         ("t (s), x (m)\n0,0\n", "times of a reference"),
         ("t (s), x (m)\n0,0\n1,1\n1,2\n", "times of a reference"),
+        ("t (s), x (m)\n0,0\n\n2,1\n1,2\n", "times of a reference, line 5.*: got 1, must be ≥ 0"),
+        ("t (s), x (m)\n-1,0\n2,1\n", "times of a reference, line 2.*: got -1, must be ≥ 0"),
         ("t (m), x (m)\n0,0\n1,1\n", "column 't .m.'.*one of s, ms"),
         ("x (m), y (m)\n0,0\n1,1\n", "column 'x .m.'.*one of s, ms"),
         ("t (s), x (ms)\n0,0\n1,1\n", "column 'x .ms.'.*one of m, cm"),
@@ -224,6 +226,13 @@ def test_rates_of_a_path_are_its_derivatives(path: Ramp | Sine | Spline) -> None
         r, *rates = path(t[[0, -1]])
         np.testing.assert_allclose(r, [first, last])
         np.testing.assert_allclose(rates, 0.0, atol=1e-12)
+
+
+def test_of_many_times_the_first_one_out_of_order_is_named() -> None:
+    """And not all of them."""
+    times = [*range(500), 7, *range(500, 900)]
+    with pytest.raises(InvalidInputError, match=r"got 7 s as number 501 of 901, must be two"):
+        ut.Reference.through(times, x=times)
 
 
 def test_references_are_refused_by_name() -> None:

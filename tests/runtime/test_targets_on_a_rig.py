@@ -57,6 +57,8 @@ def test_a_target_past_the_travel_is_refused_before_the_rig_is_read(cascade: ut.
     rig.mechanism = CRANE  # as a rig of a crane says it: nothing is compiled for one that stands
     with pytest.raises(InvalidInputError, match="got x = 2 m"):
         ut.run(cascade, rig, seconds=1.0, x0=CRANE.state(), simulated=True, target={"x": 2.0})
+    with pytest.raises(InvalidInputError, match=r"got 2.5 s, must be before the end of the run"):
+        ut.run(cascade, rig, seconds=1.0, x0=CRANE.state(), simulated=True, target=POINTS)
 
 
 @short_searches()

@@ -668,7 +668,8 @@ class Cascade:
             When the first optimisation finds no admissible surface.
         InvalidInputError
             For an unknown state name, a state that is not finite, or no start at all; for a target
-            where the mechanism cannot rest or go, before anything moves.
+            where the mechanism cannot rest or go, or that is due after the end of the run, before
+            anything moves.
         """
         x = self.mechanism.initial_state(x0, state)
         legs, plants = legs_to(self, target, duration), moving_loops(self, plant)

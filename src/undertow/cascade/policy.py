@@ -22,7 +22,7 @@ from undertow.cascade.state import CascadeState
 from undertow.closed_loop import ClosedLoop
 from undertow.closed_loop.gate import cost_gate
 from undertow.estimators import ParameterEstimate
-from undertow.law import InnerLoop, Plan, Surface
+from undertow.law import InnerLoop, Plan, Surface, check_surface_shape
 from undertow.models import FloatArray, Mechanism
 
 
@@ -218,8 +218,9 @@ def policy(
     Raises
     ------
     InvalidInputError
-        For a loop without a surface, a cascade with one, an input without a limit, and a period
-        that the law cannot bear or that does not divide the cascade's.
+        For a loop without a surface or with one of another shape, a cascade with one, an input
+        without a limit, and a period that the law cannot bear or that does not divide the
+        cascade's.
 
     Examples
     --------
@@ -245,6 +246,8 @@ def policy(
         remedy = f"Give it an Input({given.name!r}, limit=…): an action of 1 is the whole input"
         positive(what, given.limit, remedy)
     plan = None if surfaces is None else Plan.of(surfaces)
+    for surface in () if plan is None else plan.surfaces:
+        check_surface_shape(mechanism, surface)
     for law in [controller.reaching] if plan is None else plan.laws(controller.reaching):
         law.check_period("period of a policy", period, mechanism.m)
     if cascade is not None:

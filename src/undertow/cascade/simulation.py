@@ -253,6 +253,8 @@ def legs_to(
     )
     if goal is None:
         return [Leg(0.0, total, total)]
+    if isinstance(goal, SetPoints):
+        goal.check_within(total)
     motions = legs_of(cascade.mechanism, cascade.objective, goal, total)
     # The inner loop meets a jump at its next sample.
     begins = [math.ceil(t / cascade.stride - 1e-6) * cascade.stride for t, _ in motions]

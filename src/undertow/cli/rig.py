@@ -162,6 +162,8 @@ def run(
     )
     hanging = swing_up and not start
     goal = parse_target(belief, target)
+    if isinstance(goal, SetPoints):
+        goal.check_within(seconds)
     recipe = Recipe(
         mechanism=from_anywhere(name),  # a log of it can be replayed from anywhere
         parameters=parse_values(setting),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import InvalidInputError, one_for_each, positive
+from undertow.base import InvalidInputError, checked, one_for_each, positive
 from undertow.models import FloatArray, Mechanism
 from undertow.plants import Bench, Measurement
 from undertow.plants.interface import copy_numbers
@@ -64,6 +64,7 @@ class Estimator(ABC):
 
     belief: Belief | None = None
 
+    @checked
     def __init__(self, mechanism: Mechanism, period: float = 0.001) -> None:
         positive("period of an estimator", period)
         self.mechanism, self.period = mechanism, float(period)
@@ -147,16 +148,18 @@ class Measured(Estimator):
         At the first measurement without velocities, and when one is missing for longer.
     """
 
+    @checked
     def __init__(
         self, mechanism: Mechanism, period: float = 0.001, longest_gap: float = 0.02
     ) -> None:
         super().__init__(mechanism, period)
+        positive("longest gap of measured velocities, s", longest_gap, zero=True, infinite=True)
         self._x, self._v = np.zeros(2 * mechanism.n), np.zeros(mechanism.n)
         self._missed, self._longest = [0] * mechanism.n, longest_gap
 
     def reset(self, x0: ArrayLike) -> None:
         """Start again from the state x0, (2n,)."""
-        self._x[:] = x0
+        self._x[:] = self.mechanism.check_state(x0)
         self._missed = [0] * self.mechanism.n
 
     def estimate(self, measurement: Measurement, u: FloatArray) -> FloatArray:
@@ -235,7 +238,7 @@ class _Differentiator(Estimator):
 
     def reset(self, x0: ArrayLike) -> None:
         """Start again from the state x0, (2n,)."""
-        self._x[:] = x0
+        self._x[:] = self.mechanism.check_state(x0)
         self._t = math.nan
 
 
@@ -252,6 +255,7 @@ class FilteredDerivative(_Differentiator):
         τ, s, one or one per coordinate: a longer one is quieter and later.
     """
 
+    @checked
     def __init__(
         self, mechanism: Mechanism, period: float = 0.001, time_constant: ArrayLike = 0.01
     ) -> None:
@@ -290,6 +294,7 @@ class SuperTwisting(_Differentiator):
         more noise through.
     """
 
+    @checked
     def __init__(
         self, mechanism: Mechanism, period: float = 0.001, acceleration: ArrayLike = 200.0
     ) -> None:

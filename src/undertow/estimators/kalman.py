@@ -35,7 +35,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from undertow.base import InvalidInputError, one_for_each, positive
+from undertow.base import InvalidInputError, between, checked, one_for_each, positive
 from undertow.estimators.belief import EVEN, Belief, ParameterEstimate
 from undertow.estimators.interface import Estimator
 from undertow.models import (
@@ -54,6 +54,9 @@ from undertow.symbolic import BRIEF, COMPILED, Workspace, brief, unpacked
 #: to it at the target, and than what the estimated disturbance does besides: what the model leaves
 #: out, dry friction, is small beside it.
 EXCITED = 0.1
+
+#: Longest delay, with what one that is estimated may be longer, periods.
+MOST_PERIODS = 10_000
 
 #: Standard deviation of a matched disturbance before anything moves, as a part of the input's
 #: limit: half of it, two deviations, is what a controller makes up for.  With less, dry friction
@@ -401,6 +404,7 @@ class KalmanFilter(Estimator):
     [0.0]
     """
 
+    @checked
     def __init__(
         self,
         mechanism: Mechanism,
@@ -458,6 +462,8 @@ class KalmanFilter(Estimator):
         size = self._learnt + known
         self._size, self._lead = size, round(delay / period)
         longest = LONGEST * delay_tolerance
+        most = round((delay + longest) / period)
+        between("delay of a Kalman filter", most, 0, MOST_PERIODS, "periods", "Give it in seconds")
         self._room = self._lead + math.ceil(longest / period) + 2
         memory = Workspace(
             _LAYOUT, n=n, m=m, p=len(mechanism.parameters), size=size, room=self._room, known=known
@@ -506,8 +512,9 @@ class KalmanFilter(Estimator):
         learnt of parameters and of the delay is forgotten.
         """
         n, moved, learnt = self.mechanism.n, self._moved, self._learnt
+        x = self.mechanism.check_state(x0)
         self._x[:] = 0.0
-        self._x[: 2 * n] = x0
+        self._x[: 2 * n] = x
         self._P[:] = 0.0
         variances = np.zeros(len(self._x))
         variances[:n], variances[n : 2 * n] = self._variance, spread**2

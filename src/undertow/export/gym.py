@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from undertow.base import InvalidInputError, MissingExtraError, at_least, one_of
+from undertow.base import InvalidInputError, MissingExtraError, at_least, one_of, require
 from undertow.closed_loop import Event
 from undertow.display.animation import Picture
 from undertow.export.balancing import NEEDS, BalancingTask, BenchPlant, IdealPlant, Lanes
@@ -198,7 +198,7 @@ class VectorEnvironment(VectorEnv[NDArray[Any], NDArray[Any], NDArray[Any]]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._lanes = Lanes(task, num_envs)
         self._rngs = [seeding.np_random(None)[0] for _ in range(num_envs)]
-        self._left = np.zeros(num_envs, dtype=np.int64)
+        self._left = np.full(num_envs, -1)  # before reset()
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
@@ -255,8 +255,15 @@ class VectorEnvironment(VectorEnv[NDArray[Any], NDArray[Any], NDArray[Any]]):
         Raises
         ------
         InvalidInputError
-            For actions that are not (N, m) finite numbers.
+            For actions that are not (N, m) finite numbers, and before :meth:`reset`.
         """
+        require(
+            (self._left >= 0).all(),
+            "step of a vector environment",
+            "no episodes yet",
+            "episodes that reset() has begun",
+            "Call reset() first",
+        )
         over = self._left == 0
         self._lanes.u[:] = self.task.inputs(actions, self.num_envs).T
         cost, margin = self._lanes.step()

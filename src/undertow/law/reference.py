@@ -48,6 +48,7 @@ from undertow.base import (
     positive,
     raised_at,
     read_file,
+    require,
 )
 from undertow.models import (
     FloatArray,
@@ -238,6 +239,22 @@ class SetPoints:
     def times(self) -> tuple[float, ...]:
         """When each is asked for, s."""
         return tuple(t for t, _ in self.pairs)
+
+    def check_within(self, seconds: float) -> None:
+        """Refuse a set-point for which a run of so many seconds leaves no time.
+
+        Raises
+        ------
+        InvalidInputError
+            With the time of the set-point, s, and the length of the run.
+        """
+        require(
+            self.times[-1] < seconds,
+            "time of a set-point",
+            f"{self.times[-1]:g} s",
+            f"before the end of the run, {seconds:g} s",
+            "Ask for it earlier, or make the run longer",
+        )
 
     @checked
     def legs(
@@ -475,10 +492,16 @@ class Reference:
     def through(cls, times: ArrayLike, **values: ArrayLike) -> Self:
         """Return the cubic splines through points at these times, s, at rest at both ends."""
         t = floats("times of a reference", times)
-        good = t.ndim == 1 and len(t) > 1 and np.isfinite(t).all() and (np.diff(t) > 0).all()
-        if not (good and t[0] >= 0):
+        good = t.ndim == 1 and len(t) > 1
+        bad = np.flatnonzero(~((t >= 0) & np.isfinite(t) & (np.diff(t, prepend=-1) > 0)))[:1]
+        if not good or len(bad):
             raise InvalidInputError(
-                "times of a reference", value=t.tolist(), limit="two or more, finite, ≥ 0, rising"
+                "times of a reference",
+                value=f"{t[bad[0]]:g} s as number {bad[0] + 1} of {len(t)}"
+                if good
+                else f"shape {t.shape}",
+                limit="two or more, finite, ≥ 0, rising",
+                remedy="Put the points in the order of their times, each time once",
             )
         paths = {}
         for name, given in by_names("points of a reference", values).items():
@@ -655,7 +678,7 @@ def _columns(path: Path, text: str) -> tuple[FloatArray, dict[str, FloatArray], 
             value=", ".join(head) or "none",
             limit="the time and one coordinate or more, each once",
         )
-    rows = []
+    rows: list[list[float]] = []
     for number, line in enumerate(lines, 2):
         if not "".join(line).strip():
             continue
@@ -669,7 +692,22 @@ def _columns(path: Path, text: str) -> tuple[FloatArray, dict[str, FloatArray], 
                 value=repr(",".join(line))[:60],
                 limit=f"{len(names)} finite numbers",
             )
+        time = row[0]
+        if not time >= 0 or (rows and not time > rows[-1][0]):
+            raise InvalidInputError(
+                f"times of a reference, line {number} of '{path}'",
+                value=line[0].strip(),
+                limit="≥ 0, and later than the one before",
+                remedy="Put the lines in the order of their times, each time once",
+            )
         rows.append(row)
+    if len(rows) < 2:
+        raise InvalidInputError(
+            f"times of a reference in '{path}'",
+            value=len(rows),
+            limit="two or more",
+            remedy="A place to stay at is a set-point: target={name: position}",
+        )
     table = np.array(rows).reshape(-1, len(names)) * [factor for _, factor, _ in columns]
     units = {name: unit for name, _, unit in columns[1:]}
     return table[:, 0], dict(zip(units, table.T[1:], strict=True)), units

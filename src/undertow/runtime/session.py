@@ -12,7 +12,7 @@ from types import FrameType
 from undertow.base import InvalidInputError, checked, positive
 from undertow.cascade import Cascade, CascadeState
 from undertow.estimators import MakeEstimator
-from undertow.law import Reference, SetPoints, Target
+from undertow.law import Reference, SetPoints, Target, target_of
 from undertow.mechanisms.named import DataName, origin
 from undertow.models import StateLike
 from undertow.models.importers.formats import FORMATS, MJCF
@@ -274,7 +274,8 @@ def run(
     InfeasibleError
         When the first optimisation finds no admissible surface.
     InvalidInputError
-        For a rig that is none, or has another period than its controller.
+        For a rig that is none, or has another period than its controller; for a target where the
+        mechanism cannot rest or go, or that is due after the end of the run.
     ArtefactError
         When the rig cannot be read, or the log cannot be written.
     """
@@ -283,6 +284,9 @@ def run(
         positive("length of a run, s", seconds, "Leave it out for 20 s")
         if rig is not None:
             check_rig(rig, mechanism)
+        goal = None if target is None else target_of(target)
+        if isinstance(goal, SetPoints):
+            goal.check_within(seconds)
         recipe = Recipe(
             mechanism,
             start=tuple(mechanism.initial_state(x0, state).tolist()),
@@ -293,8 +297,8 @@ def run(
             encoders=encoders or {},
             period=0.001 if rig is None else rig.period,
             seconds=math.inf if simulated else max(0.01, 0.3 * settings.lead_time),
-            target=() if target is None else _points(target),
-            duration=max(1.0, seconds) if isinstance(target, Reference) else 60.0,
+            target=goal.pairs if isinstance(goal, SetPoints) else goal or (),
+            duration=max(1.0, seconds) if isinstance(goal, Reference) else 60.0,
             learns=cascade.belief != "exact",
             settings=settings,
             design=cascade,
@@ -311,14 +315,6 @@ def run(
         with prepared as runtime:
             kept.clear()  # a run closes its rig
             return runtime.run(seconds)
-
-
-def _points(
-    target: Mapping[str, float] | Target,
-) -> tuple[tuple[float, dict[str, float]], ...] | Reference:
-    if isinstance(target, Reference):
-        return target
-    return (target if isinstance(target, SetPoints) else SetPoints(target)).pairs
 
 
 def warm_up(recipe: Recipe, memory: CascadeState, *, jumps: bool = False) -> None:

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from undertow.base import ModelError
+from undertow.base import ModelError, require
 from undertow.models import FloatArray, Mechanism
 from undertow.symbolic import (
     COMPILED,
@@ -177,19 +177,17 @@ class SwingUp:
     def __post_init__(self) -> None:
         """Refuse several inputs, no potential, no limit."""
         mechanism = self.mechanism
-        if (
-            mechanism.m != 1
-            or mechanism.potential is None
-            or not math.isfinite(mechanism.inputs[0].limit)
-        ):
-            raise ModelError(
-                f"swing-up of '{mechanism.name}'",
-                value=f"{mechanism.m} inputs, "
-                f"{'no' if mechanism.potential is None else 'a'} potential, "
-                f"limit {mechanism.inputs[0].limit:g}",
-                limit="one input with a finite limit, and a potential",
-                remedy="Give potential= and a limit to the mechanism",
-            )
+        limit, bare = mechanism.inputs[0].limit, mechanism.potential is None
+        require(
+            mechanism.m == 1 and not bare and math.isfinite(limit),
+            f"swing-up of '{mechanism.name}'",
+            f"{mechanism.m} inputs, {'no' if bare else 'a'} potential, limit {limit:g}",
+            "one input with a finite limit, and a potential",
+            "Give potential= and a limit to the mechanism"
+            if mechanism.m == 1
+            else "With several inputs start it near its target, where the law holds it",
+            ModelError,
+        )
 
     @cached_property
     def _numbers(self) -> tuple[Any, FloatArray, FloatArray, float]:

@@ -42,7 +42,7 @@ MOST_BYTES, MOST_VIEWERS = 4096, 16
 #: How long a viewer may take to answer a ping, s: a suspended page is let go.
 PATIENCE = 20.0
 
-#: How long viewers have to be told the rest of what is over, s.
+#: How long viewers have to be told the rest of what is over, and then to take their leave, s.
 FAREWELL = 1.0
 
 _HEADERS = {
@@ -174,7 +174,8 @@ class Server:
             try:
                 return await self._serve(
                     self._talk, HOST, port, process_request=self._answer, compression=None,
-                    max_size=MOST_BYTES, ping_timeout=PATIENCE, server_header=None,
+                    max_size=MOST_BYTES, ping_timeout=PATIENCE, close_timeout=FAREWELL,
+                    server_header=None,
                 )  # fmt: skip
             except OSError as error:
                 if port == ports[-1]:
