@@ -118,6 +118,7 @@ def test_the_page_is_for_those_who_have_its_address() -> None:
         for path in ("../server.py", "nothing.js", "%2e%2e/server.py"):
             assert (await fetched(server.address + path))[0] == 404
         assert (await fetched(server.address, Host="evil.example"))[0] == 403
+        assert (await fetched(server.address, Origin="http://evil.example"))[0] == 403
         assert (await fetched(server.address.rstrip("/")))[2] == content("index.html")
 
     serving(Counting(), look)

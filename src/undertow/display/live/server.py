@@ -193,10 +193,10 @@ class Server:
         if not secrets.compare_digest(head.encode(), self.token.encode()):
             words = "The address lacks its token: open the one that 'undertow show' printed."
             return self._said(HTTPStatus.FORBIDDEN, words)
+        origins = request.headers.get_all("Origin")  # a browser names one for a socket, always
+        if not {*origins} <= {*self._origins} or (name == "socket" and len(origins) != 1):
+            return self._said(HTTPStatus.FORBIDDEN, "Not from another page.")
         if name == "socket":
-            origins = request.headers.get_all("Origin")
-            if len(origins) != 1 or origins[0] not in self._origins:
-                return self._said(HTTPStatus.FORBIDDEN, "Not from another page.")
             if len(self.viewers) >= MOST_VIEWERS:
                 return self._said(HTTPStatus.SERVICE_UNAVAILABLE, "Too many viewers.")
             return None
