@@ -62,8 +62,12 @@ def _claims(certified: Certified) -> Table:
 def subject_report(mechanism: Mechanism, certified: Certified) -> RenderableType:
     """Return all claims of one surface with verdict, margin, witness and method."""
     head = Text(f"{mechanism.name}, {certified.subject.surface}")
-    seconds = Text(f"{certified.seconds:.1f} s", style="dim")
-    return Group(head, "", _claims(certified), seconds)
+    spent = f"{certified.seconds:.1f} s"
+    if certified.region is not None:
+        search = certified.region.search_seconds
+        proof = certified.region_seconds - search
+        spent += f", of which {search:.1f} s searched for the region and {proof:.1f} s proved it"
+    return Group(head, "", _claims(certified), Text(spent, style="dim"))
 
 
 def appendix_report(cases: Sequence[Certified]) -> RenderableType:
