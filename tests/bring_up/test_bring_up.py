@@ -17,7 +17,13 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 import undertow as ut
-from undertow.base import ArtefactError, InfeasibleError, InvalidInputError, versions
+from undertow.base import (
+    ArtefactError,
+    InfeasibleError,
+    InvalidInputError,
+    no_progress,
+    versions,
+)
 from undertow.bring_up import (
     BringUp,
     GuardError,
@@ -35,7 +41,7 @@ from undertow.bring_up.fit import Fit, correlated, counted, dwell, readings
 from undertow.bring_up.identify import Estimate, Identification
 from undertow.bring_up.motion import MotionRecord, Predictor
 from undertow.bring_up.wiring import estimate_wiring, push_response
-from undertow.bring_up.wizard import RigFinding
+from undertow.bring_up.wizard import RigFinding, _Wizard
 from undertow.cli import app
 from undertow.mechanisms import LIBRARY
 from undertow.plants import (
@@ -104,6 +110,62 @@ def test_doublets_have_no_mean() -> None:
     u = doublets(2.0, [0.05, 0.1], 0.2, 0.001)
     assert u.sum() == 0.0
     assert set(u) == {0.0, 2.0, -2.0}
+
+
+class Swings:
+    """A rig whose pendulum swings once a second, by less and less; it counts its periods."""
+
+    period = 0.02
+
+    def __init__(self, decay: float) -> None:
+        self.decay, self.periods = decay, 0
+
+    @property
+    def time(self) -> float:
+        return self.periods * self.period
+
+    def read(self) -> Measurement:
+        self.periods += 1
+        swing = 0.3 * np.exp(-self.decay * self.time) * np.sin(2 * np.pi * self.time)
+        return Measurement(self.time, np.array([0.0, np.pi + swing]))
+
+    def write(self, u: ArrayLike) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("decay", "least", "most", "swing"),
+    [
+        (10.0, 1.0, 3.0, 0.0),  # soon at rest
+        (0.025, 185.0, 195.0, 0.0),  # falls by a third in 15 s: waited for
+        (0.012, 240.0, 240.1, 0.04),  # by a sixth: for as long as anything is
+        (0.005, 30.0, 30.1, 0.56),  # by a fourteenth: it would take a quarter of an hour
+        (0.0, 30.0, 30.1, 0.6),
+    ],
+)
+def test_rest_is_waited_for_as_long_as_that_helps(
+    decay: float, least: float, most: float, swing: float
+) -> None:
+    """What hardly falls is not waited for; the largest swing that was seen of late is known."""
+    belief, rig = ut.mechanisms.rotary_pendulum(), Swings(decay)
+    moved = _Wizard(rig, belief, rest_state(belief), no_progress)._wait_for_rest(rig)
+    assert least <= rig.time <= most
+    assert moved == pytest.approx([0.0, swing], abs=0.01)
+
+
+def test_pushes_are_counted() -> None:
+    """How long a joint swings nobody knows: which push it is stands in the progress, no time."""
+    told: list[tuple[str, float]] = []
+    belief = ut.mechanisms.rotary_pendulum()
+    rig = IdealRig(belief, rest_state(belief))
+    bring_up(rig, belief, learn=False, progress=lambda what, part: told.append((what, part)))
+    words = [what for what, _ in told]
+    assert "small pushes of voltage, 1 of at most 7" in words
+    assert {"slow ramps, 1 of 2", "slow ramps, 2 of 2"} <= set(words)
+    assert sorted(part for _, part in told) == [part for _, part in told]
 
 
 # -- signs and scales ------------------------------------------------

@@ -42,7 +42,14 @@ from undertow.proofs.search.basis import (
     linear_part,
     slowest_rate,
 )
-from undertow.proofs.search.chain import SearchBudget, _crossing, _expansion, _on_axis, grow
+from undertow.proofs.search.chain import (
+    SearchBudget,
+    _crossing,
+    _expansion,
+    _on_axis,
+    _Ring,
+    grow,
+)
 from undertow.proofs.search.chart import natural_stretch, singular_distance_on_axis
 from undertow.proofs.search.linear_program import minimise_linear
 from undertow.proofs.search.quadratic import Start, quadratic
@@ -363,6 +370,47 @@ def test_a_chain_grows_within_its_budget() -> None:
     spent = SearchBudget(8, 0.0)
     assert not spent.left
     assert not grow(motion, first, way, 4, SearchBudget(0, INF), np.random.default_rng(0))
+
+
+class Ticks:
+    """A clock that goes on by so much each time that it is asked."""
+
+    def __init__(self, tick: float) -> None:
+        self.now, self.tick = 0.0, tick
+
+    def __call__(self) -> float:
+        self.now += self.tick
+        return self.now
+
+
+def test_no_linear_program_begins_that_would_end_too_late() -> None:
+    """One is taken to be as long as the last, the next of a step that has begun too."""
+    clock = Ticks(0.0)
+    budget = SearchBudget(10, 20.0, clock=clock)
+    assert budget.left
+    with budget.spend():
+        clock.now += 7.0
+    assert budget.left
+    with budget.spend():
+        clock.now += 7.0
+    assert not budget.left
+    assert not budget.in_time
+    assert budget.programs == 8
+    assert not SearchBudget(10, 20.0, 21.0, clock).left
+
+
+def test_a_step_ends_with_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step whose samples keep disagreeing goes on for as long as there is time, no longer."""
+    x = sp.Symbol("x", real=True)
+    motion: Any = VectorField((x,), (-x + x**3,))
+    bad = np.array([[0.5]])
+    monkeypatch.setattr(_Ring, "_counterexamples", lambda *_: (bad, bad[:0]))
+    first = LyapunovFunction.quadratic(np.array([[0.5]]))
+    for seconds, programs in ((INF, 10), (5.0, 2), (9.0, 3)):
+        ring = _Ring(motion, first, 4, np.random.default_rng(0))
+        budget = SearchBudget(100, seconds, clock=Ticks(1.0))
+        assert ring.next(np.ones(1), 0.06, 0.04, 0.5, budget) is None
+        assert 100 - budget.programs == programs
 
 
 # -- from proof to proof ----------------------------------------------------------------------

@@ -53,6 +53,9 @@ LOOK = 1.0
 #: Longest wait for rest between two motions, s: a good joint swings for minutes.
 CALM = 240.0
 
+#: A wait ends, too, where what moves falls by less than this part from one span, s, to the next.
+FALLS, SPAN = 0.1, 15.0
+
 #: What is not measured for no longer than this, s, is taken to be as it was.
 GAP = 0.02
 
@@ -126,10 +129,8 @@ def bring_up(
     wizard.begin("listening", 0.0)
     if not wizard.listen():
         return wizard.result()
-    wizard.begin("small pushes", 0.1)
     if not wizard.push():
         return wizard.result()
-    wizard.begin("slow ramps", 0.25)
     wizard.break_away()
     if not learn:
         return wizard.result()
@@ -201,17 +202,25 @@ class _Wizard:
         self.findings.append(RigFinding(check, part, measured, expected, said, remedy))
 
     def _wait_for_rest(self, rig: Rig) -> FloatArray:
-        """Leave the inputs at zero until nothing moves, or for ``CALM``: the last motion, (n,)."""
-        count = round(LOOK / self.rig.period)
-        moved = np.full(self.belief.n, np.inf)
-        for _ in range(round(CALM / LOOK)):
+        """Leave the inputs at zero until nothing moves, for as long as that helps, (n,).
+
+        Return how far each coordinate moved while it was watched last: once nothing moves, in
+        ``LOOK``; where it goes on swinging, the most in any ``LOOK`` of the last ``SPAN``.
+        """
+        count, span = round(LOOK / rig.period), round(SPAN / LOOK)
+        seen: list[FloatArray] = []
+        while len(seen) < round(CALM / LOOK):
             loop = control_loop(rig, lambda _: np.zeros(self.belief.m), count)
             rows = [np.array(measured.q, dtype=float) for measured, _ in loop]
-            moved = np.ptp(np.array(rows), axis=0)
-            if not (moved > self.enough / 40).any():
-                break
+            seen.append(np.ptp(np.array(rows), axis=0))
+            if not (seen[-1] > self.enough / 40).any():
+                return seen[-1]
             self.progress(f"{self.at[0]}: it still moves", self.at[1])
-        return np.asarray(moved)
+            if len(seen) >= 2 * span:
+                before = (np.array(seen[-2 * span : -span]) / self.enough).max()
+                if (np.array(seen[-span:]) / self.enough).max() > (1 - FALLS) * before:
+                    break
+        return np.asarray(np.max(seen[-span:], axis=0))
 
     # -- listening ---------------------------------------------------------------------------
 
@@ -253,7 +262,9 @@ class _Wizard:
             response = Response.none(belief.n)
             shares = [s for s in SHARES if s <= most] or [most]
             for k, share in enumerate(shares):
-                self.begin("small pushes", 0.1 + 0.15 * (i + k / len(shares)) / belief.m)
+                which = f"{channel.name}, {k + 1} of at most {len(shares)}"
+                part = 0.1 + 0.15 * (i + k / len(shares)) / belief.m
+                self.begin(f"small pushes of {which}", part)
                 calm = self._wait_for_rest(rig)
                 push = doublets(share * channel.limit, [0.1], 0.15, self.rig.period)
                 try:
@@ -348,7 +359,9 @@ class _Wizard:
         for i, channel in enumerate(self.belief.inputs):
             levels = []
             most = 0.3 * channel.limit * min(1.0, abs(self.wiring.inputs[i]))
-            for side in (1.0, -1.0):
+            for k, side in enumerate((1.0, -1.0), start=2 * i):
+                which = f"{k + 1} of {2 * self.belief.m}"
+                self.begin(f"slow ramps, {which}", 0.25 + 0.05 * k / (2 * self.belief.m))
                 self._wait_for_rest(rig)
                 rise = ramp(side * most, 1.5, self.rig.period)
                 record = perform(rig, self._one(i, rise), 30 * self.guard, until=until)

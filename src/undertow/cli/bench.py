@@ -91,7 +91,7 @@ def bench(
         if in_a_file(rig):
             ready = f"Ready. Let {name} come to rest, hands off, and press Enter."
             exit_unless(enter_pressed(ready))
-        with progress_bar() as progress:
+        with progress_bar(left=False) as progress:  # how long it swings nobody knows
             found = bring_up(
                 miswired(plant, belief, faults),
                 belief,

@@ -118,8 +118,8 @@ def certify(
         The paper's five cases instead.
     seconds
         Time to search for each region on the surface, s, by default 60, or 0 with --appendix; 0
-        leaves regions out. A step that has begun is finished, and the proof of what is found comes
-        on top: with three coordinates minutes.
+        leaves regions out. The proof of what is found comes on top, with three coordinates minutes,
+        and so do the figures of --out.
     loop
         Also prove from how far off the target the closed loop converges: along a line up to the
         start where that names one state, else in a box of all that it names, each with both signs;
@@ -223,7 +223,10 @@ def certify(
     if not reports:
         reports.extend(certification.subject_report(mechanism, one) for one in certified)
     with progress_bar() as progress:
+        began = perf_counter()
         written = write(out, lambda: _files(mechanism, certified, progress), *reports, least=80)
+    if written:
+        written = (*written, f"Certificate and figures took {perf_counter() - began:.1f} s")
     show(*reports, *written, least=80)
     if not every:
         count = sum(len(one.subject.claims) for one in certified)

@@ -254,8 +254,11 @@ def terminal(*, stderr: bool = False) -> Console:
 
 
 @contextmanager
-def progress_bar() -> Iterator[Progress]:
-    """Show progress on standard error: a bar on a terminal, else a line for each new part."""
+def progress_bar(*, left: bool = True) -> Iterator[Progress]:
+    """Show progress on standard error: a bar on a terminal, else a line for each new part.
+
+    ``left``: say how long the rest takes, if its parts take about as long as those before.
+    """
     console = terminal(stderr=True)
     begun: list[tuple[float, float]] = []
 
@@ -265,7 +268,7 @@ def progress_bar() -> Iterator[Progress]:
         if not begun or part <= begun[0][0]:  # what takes long before any of it is done counts not
             begun[:] = [(part, now)]
         done = part - begun[0][0]
-        if done < ENOUGH or part >= 1:
+        if not left or done < ENOUGH or part >= 1:
             return what
         return f"{what}, {duration((now - begun[0][1]) * (1 - part) / done)} left"
 

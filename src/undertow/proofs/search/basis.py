@@ -26,7 +26,7 @@ class Basis:
         """Take the coordinates of ``chart``."""
         self.motion, self.chart = motion, chart
         self.size = motion.size
-        self.exponents = _even_exponents(self.size, degree)
+        self.exponents = even_exponents(self.size, degree)
 
     def _table(self, z: FloatArray) -> FloatArray:
         top = int(self.exponents.max())
@@ -63,7 +63,8 @@ class Basis:
         return self.chart.replaced(coefficients, self.exponents)
 
 
-def _even_exponents(size: int, degree: int) -> NDArray[np.int64]:
+def even_exponents(size: int, degree: int) -> NDArray[np.int64]:
+    """Return those of all monomials of even degree, up to one, without the constant, (K, N)."""
     return np.array(
         [
             e

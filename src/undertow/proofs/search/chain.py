@@ -16,6 +16,8 @@ well conditioned however far the sets have come.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -43,20 +45,36 @@ LEAST_GROWTH = 0.003
 
 
 class SearchBudget:
-    """Linear programs and process time that are left."""
+    """Linear programs and time that are left; ``pace``: how long the last one took, s."""
 
-    def __init__(self, programs: int, seconds: float) -> None:
+    def __init__(
+        self,
+        programs: int,
+        seconds: float,
+        pace: float = 0.0,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
         """Start now."""
-        self.programs, self.started, self.seconds = programs, time.process_time(), seconds
+        self.programs, self.pace, self.clock = programs, pace, clock
+        self.end = clock() + seconds
 
-    def spend(self) -> None:
-        """Count one linear program."""
+    @contextmanager
+    def spend(self) -> Iterator[None]:
+        """Count one linear program, and how long it takes with what belongs to it."""
         self.programs -= 1
+        began = self.clock()
+        yield
+        self.pace = self.clock() - began
+
+    @property
+    def in_time(self) -> bool:
+        """Whether one as long as the last would end in time."""
+        return self.clock() + self.pace < self.end
 
     @property
     def left(self) -> bool:
         """Whether another may start."""
-        return self.programs > 0 and time.process_time() - self.started < self.seconds
+        return self.programs > 0 and self.in_time
 
 
 def grow(
@@ -113,7 +131,7 @@ class _Ring:
     def next(
         self, way: FloatArray, growth: float, step: float, reach: float, budget: SearchBudget
     ) -> FloatArray | None:
-        """Coefficients of the next function; None where fresh samples keep disagreeing."""
+        """Coefficients of the next function; None where fresh samples disagree to the end."""
         basis, rng, columns = self.basis, self.rng, len(self.basis.exponents) + 1
         rate = slowest_rate(self.motion)
         rays = directions(rng, SAMPLES, self.size)
@@ -150,8 +168,9 @@ class _Ring:
         )
         goal = np.zeros(columns)
         goal[-1] = 1.0
-        for _ in range(ROUNDS):
-            budget.spend()
+        for k in range(ROUNDS):
+            if k and not budget.in_time:
+                return None
             right = np.concatenate(
                 [
                     np.full(len(decrease), -DECAY * rate),
@@ -159,10 +178,11 @@ class _Ring:
                     limits,
                 ]
             )
-            x = minimise_linear(goal, np.vstack([decrease, outside, fixed]), right)
-            if x is None or x[-1] > LARGEST:
-                return None
-            bad, low_points = self._counterexamples(x[:-1], growth, DECAY * rate, guard)
+            with budget.spend():
+                x = minimise_linear(goal, np.vstack([decrease, outside, fixed]), right)
+                if x is None or x[-1] > LARGEST:
+                    return None
+                bad, low_points = self._counterexamples(x[:-1], growth, DECAY * rate, guard)
             if not len(bad) and not len(low_points):
                 return np.asarray(x[:-1])
             decrease = np.vstack([decrease, self._decrease(bad)])

@@ -2,7 +2,8 @@
 
 Mehrotra's predictor-corrector method on the normal equations (Nocedal and Wright, *Numerical
 Optimization*, ch. 14).  With 50 unknowns and 20,000 rows an iteration costs milliseconds,
-where general sparse solvers take half a minute.
+where general sparse solvers take half a minute.  What has threads is NumPy's alone: SciPy brings
+a BLAS of its own, and the threads of two that take turns wait for each other, many times the work.
 """
 
 from __future__ import annotations
@@ -44,9 +45,11 @@ def minimise_linear(
             return np.asarray(x / columns)
         H = (A * (z / s)[:, None]).T @ A
         H[np.diag_indices(n)] += 1e-13 * np.trace(H) / n
+        if not np.isfinite(H).all():
+            break
         try:
-            factor = scipy.linalg.cho_factor(H)
-        except (np.linalg.LinAlgError, ValueError):
+            factor = np.linalg.cholesky(H, upper=True), False
+        except np.linalg.LinAlgError:
             break
         centring = -s * z
         for corrector in (False, True):

@@ -9,6 +9,7 @@ last one is raised to the largest that is proved.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -22,6 +23,7 @@ from undertow.models.mechanism import FloatArray
 from undertow.proofs.claims.region import verify_region
 from undertow.proofs.region.lyapunov import LyapunovFunction, extent
 from undertow.proofs.region.motion import SurfaceMotion
+from undertow.proofs.search.basis import even_exponents
 from undertow.proofs.search.chain import SearchBudget, grow
 from undertow.proofs.search.chart import natural_stretch
 from undertow.proofs.search.quadratic import Start, quadratic
@@ -60,6 +62,8 @@ class ProvedRegion:
     raised
         What the checker says of the last level, at most 2 % higher: never ``proved``, and
         with a witness.  ``None`` where no level up to 100 was refused.
+    search_seconds
+        How long it was searched for before the proofs, s.
     """
 
     motion: SurfaceMotion
@@ -68,6 +72,7 @@ class ProvedRegion:
     verdict: Verdict
     extent: float
     raised: Verdict | None
+    search_seconds: float = 0.0
 
     @property
     def function(self) -> LyapunovFunction:
@@ -100,22 +105,27 @@ def search_region(
     ``motion``: the sliding dynamics. ``direction``: in y, (N,); on a surface y = (q_u, q̇_u, w), so
     (1, 0, 0) is an angle at rest. ``degrees``: even degrees of the functions, one after the other;
     the first V is quadratic. ``programs``: linear programs at most, shared by the degrees.
-    ``seconds``: process time at most, likewise. ``start``: the quadratic V to begin with: ``"far"``
+    ``seconds``: time at most, likewise. ``start``: the quadratic V to begin with: ``"far"``
     reaches far along the direction and grows little; ``"round"`` starts closer and grows further;
     ``"balanced"`` is for coordinates of very different sizes. ``slow``: on a surface with one
     unactuated coordinate: whether the third of the coordinates of
     :mod:`undertow.proofs.search.chart` is η, not w. Raises UnstableSurfaceError when the surface is
     not locally stable.
     """
+    end = time.perf_counter() + seconds
     rng = np.random.default_rng(seed)
     way = np.asarray(direction, dtype=float)
     stretch = natural_stretch(motion, slow=slow)
     # A little inside what samples allow.
     chain = [quadratic(motion, stretch, way, rng, start).times(1.02)]
+    pace = 0.0  # time of a linear program, about, over the square of its columns
     for k, degree in enumerate(degrees):
         share = (k + 1) / sum(range(1, len(degrees) + 1))
-        budget = SearchBudget(math.floor(share * programs), share * seconds)
+        part = (k + 1) / sum(range(k + 1, len(degrees) + 1))  # of what time is left
+        left, size = part * (end - time.perf_counter()), len(even_exponents(motion.size, degree))
+        budget = SearchBudget(math.floor(share * programs), left, pace * size**2)
         chain += grow(motion, chain[-1], way, degree, budget, rng)
+        pace = budget.pace / size**2
     return tuple(chain)
 
 
@@ -129,9 +139,8 @@ def prove_region(
     motion, direction, seed
         As for :func:`search_region`.
     seconds
-        Process time after which no step of the search begins; one takes seconds with three
-        coordinates.  The proofs are not timed: with ``seconds`` left out the work does not depend
-        on the machine.
+        Time for the search.  The proofs are not timed: with ``seconds`` left out the work does not
+        depend on the machine.
 
     Returns
     -------
@@ -145,11 +154,13 @@ def prove_region(
     UnstableSurfaceError
         When the surface is not locally stable.
     """
+    began = time.perf_counter()
     way = np.asarray(direction, dtype=float)
     search = partial(search_region, motion, direction, seed=seed)
-    found = search(seconds=seconds)
     # Sets that start round grow furthest, but near 0 the far one is proved with far less work.
     far, balanced = search(degrees=(), start="far")[0], search(degrees=(), start="balanced")[0]
+    found = search(seconds=seconds - (time.perf_counter() - began))
+    searched = time.perf_counter() - began
 
     def decide(chain: Sequence[LyapunovFunction]) -> Verdict:
         """The last function, those before it being proved."""
@@ -161,7 +172,8 @@ def prove_region(
     level, raised = _tight_level(chain, decide)
     chain[-1] = level
     verdict = verify_region(motion, chain, max_boxes=10**12)
-    return ProvedRegion(motion, way, tuple(chain), verdict, extent(level, way) * (1 - 1e-9), raised)
+    reach = extent(level, way) * (1 - 1e-9)
+    return ProvedRegion(motion, way, tuple(chain), verdict, reach, raised, searched)
 
 
 Decide = Callable[[Sequence[LyapunovFunction]], Verdict]

@@ -69,8 +69,9 @@ class Certified:
 
     ``title``: its name in tables. ``subject``: claims and remarks, as they go into the certificate.
     ``region``: the proved region on the surface, where there is one. ``interval``: for a case of
-    the appendix, whether R ≻ 0 on its Ĩ. ``seconds``: how long it took, s. ``left_out``: what the
-    loop of a bench has and no proof here, by name.
+    the appendix, whether R ≻ 0 on its Ĩ. ``seconds``: how long it took, s; ``region_seconds``: of
+    it the region, search and proof. ``left_out``: what the loop of a bench has and no proof here,
+    by name.
     """
 
     title: str
@@ -78,6 +79,7 @@ class Certified:
     region: ProvedRegion | None = None
     interval: Verdict | None = None
     seconds: float = 0.0
+    region_seconds: float = 0.0
     left_out: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -128,12 +130,12 @@ def certify_surface(
 
     tell("stability", 0.0)
     decide = _Decisions(mechanism, surface, reaching_law, start, dict(uncertain or {}))
-    region = None
+    region, for_region = None, 0.0
 
     def so_far() -> Certified:
         subject = Subject(surface, reaching_law, tuple(decide.claims), tuple(decide.remarks))
         spent = time.perf_counter() - began
-        return Certified(title or str(surface), subject, region, seconds=spent)
+        return Certified(title or str(surface), subject, region, None, spent, for_region)
 
     def keep(claim: Claim | None, verdict: Verdict) -> None:
         decide.keep(claim, verdict)
@@ -151,7 +153,9 @@ def certify_surface(
             keep(claim, verdict)
         if seconds > 0:
             tell(f"region on the surface, a search of {seconds:g} s and a proof", first)
+            before = time.perf_counter()
             region, found, verdict = decide.region(seconds)
+            for_region = time.perf_counter() - before
             keep(found, verdict)
             if region is not None and uncertain:
                 keep(*decide.region_in_box(region))

@@ -70,7 +70,12 @@ def subject_report(mechanism: Mechanism, certified: Certified) -> RenderableType
             Text("In no proof below. Runs on random rigs, sampled, have all but other surfaces:"),
             facts(certified.left_out.items()), "",
         ]  # fmt: skip
-    return Group(*lines, _claims(certified), Text(f"{certified.seconds:.1f} s", style="dim"))
+    spent = f"{certified.seconds:.1f} s"
+    if certified.region is not None:
+        search = certified.region.search_seconds
+        proof = certified.region_seconds - search
+        spent += f", of which {search:.1f} s searched for the region and {proof:.1f} s proved it"
+    return Group(*lines, _claims(certified), Text(spent, style="dim"))
 
 
 def appendix_report(cases: Sequence[Certified]) -> RenderableType:
