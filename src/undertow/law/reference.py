@@ -240,6 +240,7 @@ class SetPoints:
         """When each is asked for, s."""
         return tuple(t for t, _ in self.pairs)
 
+    @checked
     def check_within(self, seconds: float) -> None:
         """Refuse a set-point for which a run of so many seconds leaves no time.
 
@@ -492,17 +493,14 @@ class Reference:
     def through(cls, times: ArrayLike, **values: ArrayLike) -> Self:
         """Return the cubic splines through points at these times, s, at rest at both ends."""
         t = floats("times of a reference", times)
-        good = t.ndim == 1 and len(t) > 1
-        bad = np.flatnonzero(~((t >= 0) & np.isfinite(t) & (np.diff(t, prepend=-1) > 0)))[:1]
-        if not good or len(bad):
-            raise InvalidInputError(
-                "times of a reference",
-                value=f"{t[bad[0]]:g} s as number {bad[0] + 1} of {len(t)}"
-                if good
-                else f"shape {t.shape}",
-                limit="two or more, finite, ≥ 0, rising",
-                remedy="Put the points in the order of their times, each time once",
-            )
+        limit = "two or more, finite, ≥ 0, rising"
+        require(t.ndim == 1 and len(t) > 1, "times of a reference", f"shape {t.shape}", limit)
+        with np.errstate(invalid="ignore"):  # of two that are infinite
+            good = (t >= 0) & np.isfinite(t) & (np.diff(t, prepend=-1) > 0)
+        first = int(good.argmin())
+        remedy = "Put the points in the order of their times, each time once"
+        value = f"{t[first]:g} s as number {first + 1} of {len(t)}"
+        require(good.all(), "times of a reference", value, limit, remedy)
         paths = {}
         for name, given in by_names("points of a reference", values).items():
             r = floats(f"points of '{name}'", given)
