@@ -377,7 +377,7 @@ def test_a_bench_that_a_law_does_not_bear_is_refuted_with_a_start() -> None:
     stuck = BENCH.with_friction(200.0)
     law = ut.runtime.reaching_for(ut.runtime.estimator_for(BENCH.mechanism, BENCH))
     box = np.outer(BENCH.mechanism.state(phi=1.0), [0.2, 0.3])
-    verdict = BenchLoop(stuck, ut.first_surface(BENCH.mechanism), law, box, 3.0, 24.0).tried()
+    verdict = BenchLoop(stuck, ut.first_surface(BENCH.mechanism), law, box).tried(24.0)
     assert (verdict.kind, verdict.margin) == ("refuted", -1.0)
     assert 0.2 <= verdict.witness["phi"] <= 0.3
 

@@ -85,7 +85,7 @@ def bench(
     check_out(out)
     plant = rig_named(rig, belief, mechanism_named(name), rest, faults, seed)
     if delay is None and isinstance(plant, RealisticRig):
-        delay = plant.bench.timing.input_delay + plant.bench.timing.measurement_delay
+        delay = plant.bench.timing.delay
     # Whatever asks for a stop is Ctrl-C.  Closed after what was found is shown: that may fail.
     with signals_handled(signal.default_int_handler), _closed(plant):
         if in_a_file(rig):

@@ -147,7 +147,8 @@ def certify(
     alone, whole = "one of them: a run has its own surfaces", "whole ms, 0 to 100"
     brief = "left out: of a run, stability and terminal sets are proved"
     timed, own = seconds is None or 0 <= seconds < 1e5, "an option of the loop's proof"
-    effort = certification.LOOP_SECONDS if loop_seconds is None else loop_seconds
+    usual_effort = certification.SEARCH if bench else certification.LOOP_SECONDS
+    effort = usual_effort if loop_seconds is None else loop_seconds
     region = not run and (bool(seconds) if seconds is not None or appendix or bench else True)
     require(appendix == (name is None), "undertow certify", given, "a mechanism, or --appendix")
     require(not (run and surface is not None), "--surface with --run", surface, alone)
@@ -203,9 +204,8 @@ def certify(
             )  # fmt: skip
             reports.append(certification.appendix_report(cases))
         elif place is not None:
-            own_effort = certification.SEARCH if loop_seconds is None else loop_seconds
             one = certification.certify_bench(
-                place, used, x0, seconds=seconds or 0.0, loop_seconds=own_effort,
+                place, used, x0, seconds=seconds or 0.0, loop_seconds=effort,
                 uncertain=uncertain, kept=keep, progress=progress,
             )  # fmt: skip
             keep(one)

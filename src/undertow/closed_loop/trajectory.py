@@ -201,10 +201,8 @@ class Trajectory:
         ``margin``.
         """
         mechanism = self.mechanism
-        units = [c.unit for c in mechanism.coordinates]
-        units += [f"{unit}/s" for unit in units]
         named = [
-            *zip(mechanism.state_names, self.x.T, units, strict=True),
+            *zip(mechanism.state_names, self.x.T, mechanism.state_units, strict=True),
             *((i.name, self.u[:, k], i.unit) for k, i in enumerate(mechanism.inputs)),
             *((f"s_{k}", self.s[:, k], "") for k in range(mechanism.m)),
             ("cost", self.accumulated_cost, self.cost_unit),

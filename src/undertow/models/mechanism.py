@@ -531,6 +531,12 @@ class Mechanism:
         """Names of the states, in the order of x."""
         return tuple(str(s) for s in self.x)
 
+    @property
+    def state_units(self) -> tuple[str, ...]:
+        """Units of the states, in the order of x."""
+        units = tuple(c.unit for c in self.coordinates)
+        return (*units, *(f"{unit}/s" for unit in units))
+
     @cached_property
     def parameter_symbols(self) -> tuple[sp.Symbol, ...]:
         """Parameter symbols, in order."""

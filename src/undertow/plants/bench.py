@@ -230,6 +230,11 @@ class Timing:
         """Integration step, s."""
         return self.period / self.steps
 
+    @property
+    def delay(self) -> float:
+        """From what is read to the action of the answer to it, s."""
+        return self.input_delay + self.measurement_delay
+
 
 @checked_names
 @dataclass(frozen=True)

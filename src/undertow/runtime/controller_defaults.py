@@ -64,7 +64,7 @@ def estimator_for(
         resolution=[encoder.resolution for encoder in encoders],
         time_noise=timing.jitter / math.sqrt(12),
         disturbance_drift=DRIFT * float(finite_limits(belief).min()) if drift is None else drift,
-        delay=timing.input_delay + timing.measurement_delay,
+        delay=timing.delay,
         delay_tolerance=0.0 if known is None else UNTOLD * min(SAMPLE, timing.period),
         belief=known,
     )

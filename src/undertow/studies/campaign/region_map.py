@@ -12,7 +12,7 @@ from undertow.closed_loop import ClosedLoop, Event
 from undertow.law import Surface, first_surface, matrix_at_target
 from undertow.models import FloatArray, Mechanism, fastest_rate
 from undertow.studies.campaign.definition import Settings, objective_of
-from undertow.studies.campaign.study import Arrays, Study, Variable, axes_of, state_units
+from undertow.studies.campaign.study import Arrays, Study, Variable, axes_of
 
 #: Relative tolerance of the large steps near the target.
 TAIL = 1e-4
@@ -59,7 +59,8 @@ class RegionMap(Study):
         self.sliding = settings.flag("sliding")
         names = mechanism.state_names
         driven = names[n : n + m] if self.sliding else ()
-        free = {k: v for k, v in state_units(mechanism).items() if k not in driven}
+        units = zip(names, mechanism.state_units, strict=True)
+        free = {name: unit for name, unit in units if name not in driven}
         self.axes = axes_of(settings, free)
         fixed = settings.table("at").by_name([k for k in free if k not in self._names])
         require(self.axes, settings.what("axes"), "none", f"states among {', '.join(free)}")

@@ -222,9 +222,3 @@ def tolerances(parameters: Iterable[Parameter], spread: float) -> dict[str, floa
         p.name: min(spread, 0.99 * min(p.high - p.value, p.value - p.low) / abs(p.value))
         for p in parameters
     }
-
-
-def state_units(mechanism: Mechanism) -> dict[str, str]:
-    """Return the units of a mechanism's states by name."""
-    units = [c.unit for c in mechanism.coordinates]
-    return dict(zip(mechanism.state_names, [*units, *(f"{u}/s" for u in units)], strict=True))

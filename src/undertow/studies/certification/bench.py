@@ -77,7 +77,7 @@ def certify_bench(
     require(whole, "period of the bench", f"{hold:g} ms", "whole ms, 1 to 100")
     law = reaching_for(estimator_for(mechanism, bench)) if reaching_law is None else reaching_law
     box = np.column_stack([-np.abs(start), np.abs(start)])
-    loop = BenchLoop(bench, surface, law, box, 0.0, *trials)
+    loop = BenchLoop(bench, surface, law, box)
     missing = left_out(loop, uncertain or {})
     base = certify_surface(
         mechanism, surface, start, reaching_law=law, seconds=seconds, loop=True,
@@ -90,9 +90,10 @@ def certify_bench(
         return found
     if "closed loop" in proved:
         box = LoopClaim.of(proved["closed loop"].claim).box(mechanism)
-    loop = replace(loop, starts=box, rate=proved["stability"].verdict.margin)
-    for tried in (loop.tried, loop.exported_tried):
-        remarks = (*found.subject.remarks, tried(progress))
+    slow = float(np.ceil(DECAYS / proved["stability"].verdict.margin))
+    loop = replace(loop, starts=box, seconds=min(LONGEST, max(SHORTEST, slow)))
+    for tried, most in zip((loop.tried, loop.exported_tried), trials, strict=True):
+        remarks = (*found.subject.remarks, tried(most, progress))
         seconds = time.perf_counter() - began
         found = replace(found, subject=replace(found.subject, remarks=remarks), seconds=seconds)
         kept(found)
@@ -103,18 +104,14 @@ def certify_bench(
 class BenchLoop:
     """The loop of a bench that keeps one surface; the bench's mechanism is the controller's model.
 
-    ``starts``: the box of states, (2n, 2), in which trials begin. ``rate``: of the slowest motion
-    on the surface, 1/s. ``tried_for``, ``exported_for``: how long the law and its C are tried in
-    all, s of simulated time.
+    ``starts``: the box of states, (2n, 2), in which trials begin. ``seconds``: of a trial, s.
     """
 
     bench: Bench
     surface: Surface
     law: ReachingLaw
     starts: FloatArray
-    rate: float
-    tried_for: float = TRIED
-    exported_for: float = EXPORTED
+    seconds: float = SHORTEST
 
     @property
     def mechanism(self) -> Mechanism:
@@ -134,13 +131,9 @@ class BenchLoop:
         """Its standard deviations, (2n,)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
-    @property
-    def _seconds(self) -> float:
-        return min(LONGEST, max(SHORTEST, float(np.ceil(DECAYS / self.rate))))
-
-    def _runs(self, duration: float) -> int:
-        """How many runs take so long in all, s; one at least."""
-        return max(1, int(duration / self._seconds))
+    def _runs(self, most: float) -> int:
+        """How many trials take so long in all, s; one at least."""
+        return max(1, int(most / self.seconds))
 
     @property
     def _words(self) -> str:
@@ -149,19 +142,19 @@ class BenchLoop:
         ranges = ", ".join(f"|{name}| ≤ {most:.4g}" for name, most in names if most)
         return f"from {ranges or 'the target'}, the rest of the state 0"
 
-    def tried(self, progress: Progress = no_progress) -> Verdict:
-        """Decide by trials whether starts are home within the time and stay there.
+    def tried(self, most: float, progress: Progress = no_progress) -> Verdict:
+        """Decide by trials, of so long in all, s, whether starts come home in time and stay.
 
         The controller is that of `undertow run` with no other surface: filter, law, the estimated
         disturbance taken off the output. Each trial has a rig of its own.
         """
         make = keeping(self.mechanism, self.surface, self.law)
         bench, off, lost = replace(self.bench, hand={}), list[FloatArray](), list[FloatArray]()
-        count = self._runs(self.tried_for)
+        count = self._runs(most)
         for seed in each(range(count), progress, lambda _: "runs on random rigs"):
             x0 = self._start(seed)
             run = trial(
-                self.mechanism, bench, make, x0, self._seconds, seed, estimator=self._estimator()
+                self.mechanism, bench, make, x0, self.seconds, seed, estimator=self._estimator()
             )
             if run.balanced:
                 off.append(self._error(run.record))
@@ -169,7 +162,7 @@ class BenchLoop:
                 lost.append(x0)
         words = (
             f"{self._words}, the law of a run with its filter, delay and disturbance estimate "
-            f"brings random rigs of the bench home within {self._seconds:g} s, for a second"
+            f"brings random rigs of the bench home within {self.seconds:g} s, for a second"
         )
         ratio = np.mean(off, axis=0) / self.stated if off else np.full(len(self.stated), np.nan)
         errors = ", ".join(
@@ -182,11 +175,11 @@ class BenchLoop:
         )
         return self._verdict(words, count, lost, more)
 
-    def exported_tried(self, progress: Progress = no_progress) -> Verdict:
+    def exported_tried(self, most: float, progress: Progress = no_progress) -> Verdict:
         """Decide the same of the exported C, compiled here, beside how far its law differs."""
         words = f"{self._words}, the exported C holds random rigs of the bench"
         bench, lost = replace(self.bench, hand={}), list[FloatArray]()
-        count = self._runs(self.exported_for)
+        count = self._runs(most)
         try:
             controller = EmbeddedController(
                 self.mechanism, self.surface, self.law, self.bench.timing.period, KalmanStep()
@@ -198,7 +191,7 @@ class BenchLoop:
                     x0 = self._start(seed)
                     with build.start() as process:
                         rig = RealisticRig(bench, x0, seed)
-                        if not run_on_rig(process, rig, self._seconds).held:
+                        if not run_on_rig(process, rig, self.seconds).held:
                             lost.append(x0)
         except UndertowError as error:
             return Verdict(words, "undecided", method=str(error))
@@ -213,9 +206,8 @@ class BenchLoop:
 
     def _error(self, record: Record) -> FloatArray:
         """Root mean square of what the estimate is off the state at the moment it is for."""
-        timing = self.bench.timing
         late = record.t > FOUND
-        acts = record.t[late] + timing.input_delay + timing.measurement_delay
+        acts = record.t[late] + self.bench.timing.delay
         then = np.array([np.interp(acts, record.t, column) for column in record.truth.T]).T
         return np.asarray(np.sqrt(np.mean((record.x[late] - then) ** 2, axis=0)))
 
@@ -235,32 +227,30 @@ class BenchLoop:
 def left_out(loop: BenchLoop, uncertain: Box) -> Mapping[str, str]:
     """Return what the bench has and the proof has not; ``uncertain`` parameters it has."""
     bench, mechanism = loop.bench, loop.mechanism
-    units = [c.unit for c in mechanism.coordinates]
-    states = [*units, *(f"{unit}/s" for unit in units)]
-    stated = ", ".join(
-        f"{name} {value:.2g} {unit}"
-        for name, value, unit in zip(mechanism.state_names, loop.stated, states, strict=True)
-    )
+    names, states = [c.name for c in mechanism.coordinates], mechanism.state_names
+    units = dict(zip(states, mechanism.state_units, strict=True))
+    forces = dict(zip(names, mechanism.force_units, strict=True))
+    errors = zip(states, loop.stated.tolist(), strict=True)
+    stated = ", ".join(f"{name} {value:.2g} {units[name]}" for name, value in errors)
     timing, rows = bench.timing, loop.surface.matrix
     share = np.sqrt(np.diag(rows @ loop.covariance @ rows.T))
     layer = loop.law.per_surface(mechanism.m)[1]
     of_layer = ", ".join(f"{part:.0%}" for part in share / layer)
     known = {name: width for name, width in bench.tolerance.items() if name not in uncertain}
-    delay = 1e3 * (timing.input_delay + timing.measurement_delay)
     found = {
         "the estimate": f"it is exact in the proof. The filter states a standard deviation at rest "
         f"of {stated}, which moves s by {of_layer} of the layer",
-        "the delay": f"{delay:g} ms from reading to action, ± {1e3 * timing.jitter:g} ms. The "
-        "filter predicts to the moment when its answer acts; with exact predictions the loop is "
+        "the delay": f"{1e3 * timing.delay:g} ms from reading to action, ± "
+        f"{1e3 * timing.jitter:g} ms. The filter predicts to the moment when its answer acts; with exact predictions the loop is "
         "the one that is proved, begun when the first input acts",
         "parameters": ", ".join(f"{name} ± {100 * width:g} %" for name, width in known.items()),
         "dry friction": ", ".join(
-            f"{name} {one.coulomb:.3g}, to break away {one.F_s:.3g} {_force(mechanism, name)}"
+            f"{name} {one.coulomb:.3g}, to break away {one.F_s:.3g} {forces[name]}"
             for name, one in bench.friction.items()
         ),
         "backlash": ", ".join(bench.backlash),
         "encoders": ", ".join(
-            f"{name} {one.resolution:.2g} {_unit(mechanism, name)} a count"
+            f"{name} {one.resolution:.2g} {units[name]} a count"
             for name, one in bench.encoders.items()
         ),
         "amplifiers": ", ".join(
@@ -276,11 +266,3 @@ def left_out(loop: BenchLoop, uncertain: Box) -> Mapping[str, str]:
         "(undertow certify --run)",
     }  # fmt: skip
     return {what: said for what, said in found.items() if said}
-
-
-def _unit(mechanism: Mechanism, name: str) -> str:
-    return next(c.unit for c in mechanism.coordinates if c.name == name)
-
-
-def _force(mechanism: Mechanism, name: str) -> str:
-    return "N m" if _unit(mechanism, name) == "rad" else "N"

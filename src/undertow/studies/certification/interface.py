@@ -91,19 +91,18 @@ def certify(
     positive("time of the search, s", seconds, zero=True)
     positive("time of the loop's search, s", loop_seconds)
     if bench is not None:
-        same = bench.mechanism.fingerprint == mechanism.fingerprint
-        require(
-            same, "mechanism of the bench", f"another '{bench.mechanism.name}'", "the one given"
-        )
+        same, given = bench.mechanism.fingerprint == mechanism.fingerprint, bench.mechanism.name
+        require(same, "mechanism of the bench", f"another '{given}'", "the one that is certified")
         require(not (loop or hold), "loop and hold, with a bench", (loop, hold), "left out")
-        loop, hold = True, 1
-    given, own = "without loop=True", "left out: it is for the closed loop's proof"
-    require(loop or not hold, "hold", f"{hold}, {given}", own)
-    require(loop or loop_seconds == LOOP_SECONDS, "loop_seconds", f"{loop_seconds:g}, {given}", own)
-    bears = "a region to prove it for, seconds above 0, or loop=True"
-    require(loop or seconds or not uncertain, "uncertain", uncertain, bears)
-    held = "a held input, such as hold=1"
-    require(hold or not (loop and uncertain), "uncertain, with loop=True", uncertain, held)
+    else:
+        given, own = "without loop=True", "left out: it is for the closed loop's proof"
+        require(loop or not hold, "hold", f"{hold}, {given}", own)
+        untold = loop or loop_seconds == LOOP_SECONDS
+        require(untold, "loop_seconds", f"{loop_seconds:g}, {given}", own)
+        bears = "a region to prove it for, seconds above 0, or loop=True"
+        require(loop or seconds or not uncertain, "uncertain", uncertain, bears)
+        held = "a held input, such as hold=1"
+        require(hold or not (loop and uncertain), "uncertain, with loop=True", uncertain, held)
     known = x0 is not None or state or mechanism.start
     start = mechanism.initial_state(x0, state) if known else np.zeros(2 * mechanism.n)
     progress = progress or no_progress
