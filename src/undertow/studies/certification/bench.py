@@ -241,8 +241,8 @@ def left_out(loop: BenchLoop, uncertain: Box) -> Mapping[str, str]:
         "the estimate": f"it is exact in the proof. The filter states a standard deviation at rest "
         f"of {stated}, which moves s by {of_layer} of the layer",
         "the delay": f"{1e3 * timing.delay:g} ms from reading to action, ± "
-        f"{1e3 * timing.jitter:g} ms. The filter predicts to the moment when its answer acts; with exact predictions the loop is "
-        "the one that is proved, begun when the first input acts",
+        f"{1e3 * timing.jitter:g} ms. The filter predicts to the moment when its answer acts; with "
+        "exact predictions the loop is the one that is proved, begun when the first input acts",
         "parameters": ", ".join(f"{name} ± {100 * width:g} %" for name, width in known.items()),
         "dry friction": ", ".join(
             f"{name} {one.coulomb:.3g}, to break away {one.F_s:.3g} {forces[name]}"
